@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 import brdf
 from brdf.channels import channel_names
@@ -33,7 +33,7 @@ from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
 from fitting.solver.nnls import inverse_diagonal, nonnegative_minima
 from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum, refit, search
+from fitting.solver.profile import Optimum, refit, search, within_sight
 from fitting.solver.refinement import TOLERANCE_DOUBLE
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels, places_of
@@ -46,8 +46,6 @@ from fitting.uneven_noise import evened, noise_of_each, with_bounds
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
-# The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
-UNSEEN = 60.0
 # A highlight that explains less than this share of what errs together without it is none.
 EXPLAINED = 0.35
 # One that explains this share of all squares is one: sums over few blocks, as of a small picture, say little.
@@ -149,7 +147,7 @@ def _fitted(observed: Observed) -> _Fitted:
         fit = _fit_model(brdf.MODELS[problem.model], observed)
         return *_less_codec_errors(fit, None, observed), None
     for name in problem.families if observed.reached(brdf.Lambert)[1].any() else ("lambert",):
-        if isinstance(observed.tiles, Stream) and problem.loss == "squared":
+        if isinstance(observed.tiles, Stream) and problem.loss == "squared" and not observed.limited:
             # The pictures of one model at a time are in memory; those of the others are made anew where asked for.
             fits = {
                 done: fit._replace(pictures=each(partial(picture_of, fit.model), observed.tiles))
@@ -270,22 +268,12 @@ def _fit_about(
     limits: Sequence[tuple[float, float]] = (),
 ) -> ModelFit:
     """One model, whose lobe may be tabulated near some exponents."""
-    free, n_range = within_sight(pictures, free, between(near, observed.problem.n_range))
-    optimise = partial(search, free=free, n_range=n_range)
-    loss, about = observed.problem.loss, {"owner": observed.owner, "copies": observed.copies}
-    pictures, optimum, factor = reweight(pictures, optimise(pictures), optimise, loss, observed.rounding, limits)
+    n_range, loss = between(near, observed.problem.n_range), observed.problem.loss
+    optimum, among = search(pictures, *within_sight(pictures, free, n_range)), (free, n_range)
+    pictures, optimum, factor = reweight(pictures, optimum, among, loss, observed.rounding, limits)
+    free, n_range = within_sight(pictures, free, n_range)
+    about = {"owner": observed.owner, "copies": observed.copies}
     return ModelFit(model, pictures, optimum, free, n_range, noise_factor=factor, **about)
-
-
-def within_sight(
-    pictures: Sequence[Picture], free: Bool[np.ndarray, "3 C"], n_range: tuple[float, float]
-) -> tuple[Bool[np.ndarray, "3 C"], tuple[float, float]]:
-    """What may be above 0, and exponents of which some pixel sees a trace: with larger ones k_s could be anything."""
-    if not free[2].any():
-        return free, n_range
-    peak = max(picture.nearest_peak for picture in pictures)
-    upper = min(n_range[1], UNSEEN / max(-peak, UNSEEN / n_range[1]))
-    return (free, (n_range[0], upper)) if upper >= n_range[0] else (free & [[True], [True], [False]], n_range)
 
 
 def _simplest(
@@ -339,7 +327,7 @@ def _comparable(fits: Mapping[str, ModelFit], observed: Observed) -> dict[str, M
     problem = observed.problem
     fits = {name: fit for name, fit in fits.items() if not _too_wide(fit, problem)}
     fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, observed))}
-    if problem.loss != "squared" or np.isfinite(np.asarray(observed.limits)).any():
+    if problem.loss != "squared" or observed.limited:
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared;
         # so do pixels that no family says to be near a limit.
         best = min(fits.values(), key=lambda fit: float(np.sum(residual_noise(fit.optimum, observed.rounding))))
@@ -350,10 +338,10 @@ def _comparable(fits: Mapping[str, ModelFit], observed: Observed) -> dict[str, M
     return _best_first(fits)
 
 
-def _weight_of_all(picture: Picture, *others: Picture) -> Array | None:
+def _weight_of_all(picture: Picture, *others: Picture) -> Array:
     """That of a picture, 0 where that of another one is."""
     count = np.logical_and.reduce([np.asarray(other.weights) > 0 for other in others])
-    return None if picture.weight is None else jnp.where(count, picture.weights, 0)
+    return jnp.where(count, picture.weights, 0)
 
 
 def _told_apart_by(

@@ -30,7 +30,7 @@ from brdf.precision import working_precision
 from brdf.rendering import basis_columns
 from brdf.vectors import quotient
 from fitting.budget.sampling import sample_counts, with_samples
-from fitting.core import fit_pictures, picture_of, within_sight
+from fitting.core import fit_pictures, picture_of
 from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
 from fitting.likelihood import how_many_alike, weight_of_alike
 from fitting.model_fit import N_RANGE
@@ -38,7 +38,7 @@ from fitting.pixels import Tile
 from fitting.problem import state_problem
 from fitting.result import Cause, FitResult
 from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import search
+from fitting.solver.profile import search, within_sight
 
 BLACK = (
     "subtract the camera's black level, or give the scene the [ambient] light that it lacks, a photograph --ambient, "
@@ -358,12 +358,14 @@ class Residual:
                 picture.slopes(picture.moves.get(name, [np.zeros(picture.target.shape)] * ways))
                 for picture in self.pictures
             ]
-            columns = np.array([left for left in map(self._unfollowed, self._flat(slopes)) if np.any(left)]).T
+            unfollowed = np.array(list(map(self._unfollowed, self._flat(slopes))))
+            moving = np.any(unfollowed, axis=1)
+            columns, sizes = unfollowed[moving].T, np.zeros(ways)
             if not columns.size:
                 continue
-            sizes, gain = self._explained(columns)
+            sizes[moving], gain = self._explained(columns)
             length = float(np.linalg.norm(sizes))
-            column, left = columns @ sizes / max(length, TINY), self.left - columns @ sizes
+            column, left = columns @ sizes[moving] / max(length, TINY), self.left - columns @ sizes[moving]
             # Channels of a pixel, and pixels of a block, may err together: squares of their sums, over those of each.
             scores = column * left
             together = np.bincount(self._block, scores.reshape(self.channels, -1).sum(axis=0))
@@ -371,7 +373,7 @@ class Residual:
             error = math.sqrt(inflation / max(float(column @ column), TINY))
             most *= min(self.pictures[0].scene.resolution) if unit == "pixels" else 1
             if max(length, error) < most:
-                size = float(sizes[0]) if len(sizes) == 1 else length
+                size = float(sizes[moving][0]) if columns.shape[1] == 1 else length
                 share = min(gain / max(self.excess, gain, TINY), 1.0)
                 yield _Test(Cause(name, size, error, unit, share, remedy), columns, gain, inflation, sizes)
 

@@ -51,14 +51,12 @@ from brdf.rendering import Basis, basis
 from fitting.problem import check_exponents
 from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.normal_equations import totals
-from fitting.solver.profile import lowest_in_cells
+from fitting.solver.profile import UNSEEN, lowest_in_cells
 
 # As a function of log n a lobe varies on a scale of 1 or more; Hermite's cubic over such a cell finds every valley.
 GRID_STEP = 0.7
 # Newton's steps double the digits, from a cell's cubic to the end of the precision.
 STEPS = {"float32": 4, "float64": 6}
-# The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
-UNSEEN = 60.0
 
 
 class Solution(NamedTuple):

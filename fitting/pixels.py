@@ -105,6 +105,11 @@ class Observed(NamedTuple):
         return [self.problem.targets[picture].pixels.shape[1] for picture in self.owner]
 
     @property
+    def limited(self) -> bool:
+        """Whether pixels were left out by what they show."""
+        return bool(np.isfinite(np.asarray(self.limits)).any())
+
+    @property
     def rounding(self) -> Float[np.ndarray, " C"]:
         """The largest of any picture."""
         return np.max(self.roundings, axis=0)

@@ -38,7 +38,10 @@ def with_bounds(observed: Observed, *, in_codes: bool = False) -> Observed:
     floats = [one.codes is None for one in targets]
     if not any(floats) or any(one.streamed or one.least_squares for one in targets):
         return observed
-    if all(floats) and (isinstance(tiles, Stream) or all(tile.bounds is None for tile in tiles)):
+    # Tiles that are made anew each time are asked only where something is clipped.
+    clipped = bool(observed.left_out.get("clipped"))
+    some = clipped if isinstance(tiles, Stream) else any(tile.bounds is not None for tile in tiles)
+    if all(floats) and not some:
         return observed
     exact, step = all(floats) and not in_codes, ROUNDED * float(np.max(observed.brightest))
 

@@ -23,10 +23,10 @@ from brdf.lobes import STACKED_VALUES, STORED_SAMPLES, Near
 from fitting.budget.configurations import Configuration, Run, run
 from fitting.budget.error_estimate import Probes, is_dithered
 from fitting.budget.sampling import sample_counts, with_samples
-from fitting.core import UNSEEN
 from fitting.problem import FitProblem, has_pixel_areas
 from fitting.sample_error import MOST, SampleError, near_exponent
 from fitting.solver.nnls import scaled_inverse
+from fitting.solver.profile import UNSEEN
 from fitting.uncertainty.covariance import LOST_IN_NOISE
 
 # Pixels of the first fit, its samples, and those that are tried.

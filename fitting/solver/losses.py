@@ -19,17 +19,17 @@ is the residual of all channels of a pixel together, in units of a scale taken f
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum
+from fitting.solver.profile import Optimum, search, within_sight
 from fitting.solver.streams import each
 
 Loss = Literal["squared", "huber", "cauchy", "relative", "log"]
@@ -58,7 +58,7 @@ ENOUGH = 1e-4
 def reweight(
     pictures: Sequence[Picture],
     optimum: Optimum,
-    optimise: Callable[[Sequence[Picture]], Optimum],
+    among: tuple[Bool[np.ndarray, "3 C"], tuple[float, float]],
     loss: Loss,
     rounding: Float[np.ndarray, " C"],
     limits: Sequence[tuple[float, float]],
@@ -67,9 +67,10 @@ def reweight(
 
     Pixels beyond ``limits``, of each picture, were left out by what they show; so are, by what is predicted, those that
     noise keeps within them or not: of these the ones that are left err to one side.
-    No scale is below ``rounding``, the standard deviation of a value's. Gives the pictures with the weights of the last
-    round, its optimum, and what the weighted residual's standard deviation is multiplied by to give that which the
-    formula for standard errors needs: the weights know the residuals.
+    ``among`` is which coefficients are free, and between which exponents is sought. No scale is below ``rounding``, the
+    standard deviation of a value's. Gives the pictures with the weights of the last round, its optimum, and what the
+    weighted residual's standard deviation is multiplied by to give that which the formula for standard errors needs:
+    the weights know the residuals.
     """
     now, robust = pictures, loss in ("huber", "cauchy")
     limited = bool(np.isfinite(np.asarray(limits)).any())
@@ -87,7 +88,7 @@ def reweight(
             at = optimum if round_ < LIMITING_ROUNDS else at
             noise = np.sqrt(at.cost / np.maximum(at.pixels, 1)) if loss == "squared" else _scale(pictures, at, rounding)
             now = each(partial(_within, optimum=at, noise=noise), now, pictures, limits)
-        optimum = optimise(now)
+        optimum = search(now, *within_sight(now, *among))
         if limited and np.any(optimum.pixels == 0):
             # Noise reaches from one limit to the other.
             optimum, limited = before, False

@@ -54,6 +54,9 @@ UNRESOLVED = 0.1
 # Hermite's cubic over a grid cell is within this share of the change that the steeper end's slope would make over it.
 GRID_ERROR = 0.02
 
+# The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
+UNSEEN = 60.0
+
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
@@ -98,6 +101,17 @@ class Optimum:
     def normal(self, variance: Float[np.ndarray, " C"] | float = 1.0) -> NormalEquations:
         """Normal equations of all channels by the variance of each one's noise."""
         return join_channels(self.gram, self.product, self.square, self.x[2], variance)
+
+
+def within_sight(
+    pictures: Sequence[Picture], free: Bool[np.ndarray, "3 C"], n_range: tuple[float, float]
+) -> tuple[Bool[np.ndarray, "3 C"], tuple[float, float]]:
+    """What may be above 0, and exponents of which some pixel sees a trace: with larger ones k_s could be anything."""
+    if not free[2].any():
+        return free, n_range
+    peak = max(picture.nearest_peak for picture in pictures)
+    upper = min(n_range[1], UNSEEN / max(-peak, UNSEEN / n_range[1]))
+    return (free, (n_range[0], upper)) if upper >= n_range[0] else (free & [[True], [True], [False]], n_range)
 
 
 def search(

@@ -1,5 +1,6 @@
 """From the solver's numbers to a material, its errors, and what a user should know of them."""
 
+import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
@@ -58,6 +59,7 @@ GROWING = (
     "the noise grows with brightness; the errors allow for it, but {}: told of the camera's noise, or with the "
     "relative loss, the same picture says more"
 )
+NEAR = "predicted where noise decides whether they are clipped or dark"
 # A coefficient of which values that are not clipped tell less than this share of what they tell of another channel's.
 CLIPPED_SHARE, CLIPPED = 1e-3, "the values that would tell it are clipped"
 # An interval of n wider than this factor says nothing but its order of magnitude.
@@ -73,6 +75,10 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     optimum, pictures, evidence = fit.optimum, fit.pictures, fit.evidence
     about = observed.result_fields() | {"optimum": optimum, "pixels": int(np.min(optimum.pixels))}
     about["residual"] = fit.residual
+    if observed.limited:
+        every = sum(math.prod(target.pixels.shape[:2]) for target in observed.problem.targets)
+        near = every - sum(observed.left_out.values()) - about["pixels"]
+        about["left_out"] = observed.left_out | {NEAR: near}
     weight = _typical_weight(pictures)
     rounding, columns = observed.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.channel_errors import residuals
+from brdf.precision import cast
 from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.normal_equations import AnyArray, Picture, Sums, sums
 from fitting.solver.profile import Optimum
@@ -175,11 +175,16 @@ def misweighted_sums(
     if likely < best[-1][0] + RISE:
         return None
 
-    def beside(picture: Picture, weight: AnyArray) -> AnyArray:
-        spread = variance_at(growing, np.maximum(picture.predict(optimum.n, optimum.x), 0.0))
-        return np.asarray(picture.weights, float) * np.asarray(weight, float) ** (1 - power) * spread
+    grows = bool(growing[:, 1:].any())
 
-    return sums_at(pictures, optimum, each(beside, pictures, given)), growing if growing[:, 1:].any() else None
+    def beside(picture: Picture, weight: AnyArray) -> AnyArray:
+        value = np.maximum(picture.predict(optimum.n, optimum.x), 0.0) if grows else np.zeros((1, len(growing)))
+        of_weight = np.asarray(picture.weights, float) * np.asarray(weight, float) ** (1 - power)
+        return np.broadcast_to(of_weight * variance_at(growing, value), picture.target.shape)
+
+    # Squares of weights may differ by more than single precision holds.
+    double = each(lambda picture: cast(picture, "float64"), pictures)
+    return sums_at(double, optimum, each(beside, pictures, given)), growing if grows else None
 
 
 def _residual_value_weight(
@@ -193,4 +198,5 @@ def _residual_value_weight(
     some = picture.in_double(pixel)
     weight = np.broadcast_to(weight, (len(picture.target), weight.shape[1]))[pixel] * (some.weights > 0)[: pixel.size]
     shown = np.asarray(some.predict(optimum.n, optimum.x), float)
-    return residuals(some, optimum)[: pixel.size].T, shown[: pixel.size].T, np.asarray(weight, float).T
+    left = np.where(some.weights > 0, some.target - shown, 0.0) * np.sqrt(some.weights)
+    return left[: pixel.size].T, shown[: pixel.size].T, np.asarray(weight, float).T

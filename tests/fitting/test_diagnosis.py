@@ -9,6 +9,7 @@ import pytest
 
 import brdf
 import fitting
+from brdf.geometry.triangles import Mesh
 
 SIZE = 64
 PIXEL = 2.2 / SIZE
@@ -84,6 +85,26 @@ def test_a_circle_that_is_far_off_is_told(name: str):
     assert cause.name == name
     assert abs(cause.size) == pytest.approx(3, abs=2.5 * cause.error)
     assert cause.error < 0.15
+
+
+def test_a_move_that_changes_nothing_is_none_of_a_light():
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 17)
+    ring = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=-1)
+    lower, corner = np.arange(16), [0.0, 1.0, 0.0]
+    faces = [(i, i + 1, i + 18) for i in lower] + [(i, i + 18, i + 17) for i in lower]
+    half = brdf.Triangles(Mesh(np.concatenate([ring - corner, ring + corner]), faces))
+    true, told = (
+        dataclasses.replace(
+            SCENE,
+            shapes=(half,),
+            lights=(brdf.DirectionalLight([np.sin(turn), 0, np.cos(turn)], [1.0]),),
+        )
+        for turn in np.radians([30, 35])
+    )
+    # Of the cylinder's normals none leaves the plane in which the light has turned.
+    cause = fitted(drawn(true), told).diagnosis[0]
+    assert cause.name == "light"
+    assert abs(cause.size) == pytest.approx(5, abs=3 * cause.error)
 
 
 def test_a_plane_that_faces_away_from_its_light_ends_no_diagnosis():
