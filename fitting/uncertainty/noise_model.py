@@ -35,7 +35,7 @@ RISE = 20.0
 EVEN = 1.2
 MOST_VALUES = 4096
 # Of so many pixels at most it is asked what noise knows of their weights.
-MOST_PIXELS = 1 << 15
+MOST_PIXELS = 1 << 13
 ROUNDS = 6
 # A power of the value depends on the others where they leave less of it.
 DEPENDENT = 1e-13
