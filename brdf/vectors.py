@@ -168,7 +168,7 @@ def divide(numerator: ArrayLike, denominator: ArrayLike) -> Array:
 
 
 def quotient(numerator: Any, denominator: Any, otherwise: float = 0.0) -> Any:
-    """In NumPy numerator / denominator where that is positive, else another number."""
+    """In NumPy, without a derivative: numerator / denominator where that is positive, else another number."""
     shape = np.broadcast_shapes(np.shape(numerator), np.shape(denominator))
     return np.divide(numerator, denominator, out=np.full(shape, otherwise), where=denominator > 0)
 

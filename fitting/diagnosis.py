@@ -387,9 +387,9 @@ class Residual:
         def left(times: float) -> float:
             lit = []
             for picture, some in zip(self.pictures, moves, strict=True):
-                parts = zip(test.sizes, some, strict=True) if some else ()
-                steps = [{leaf: times * size * step for leaf, step in move.items()} for size, move in parts]
-                together = {leaf: sum(step[leaf] for step in steps) for leaf in {*itertools.chain(*steps)}}
+                together: dict[str, Any] = {}
+                for size, move in zip(test.sizes, some, strict=False):  # none of another picture's light
+                    together |= {leaf: together.get(leaf, 0.0) + times * size * step for leaf, step in move.items()}
                 lit.append(picture.lit(self.model, coarse=True, move=together))
             return self._least(lit, counted, [()] * len(lit))
 

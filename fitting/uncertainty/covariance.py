@@ -31,6 +31,7 @@ LOST_IN_NOISE = "the highlight does not stand out of the noise"
 # A specular term counts when leaving it out raises the cost by so many noise variances for each of its unknowns.
 SIGNIFICANT = 10.0
 
+TINY = np.finfo(float).tiny
 # With less than this of values less unknowns nothing is left to tell an error by.
 FEWEST_DEGREES = 0.5
 FEW_PIXELS = "as few pixels count as there are numbers: nothing is left to tell its error by"
@@ -121,7 +122,7 @@ class Uncertainty(NamedTuple):
 def residual_noise(optimum: Optimum, rounding: Float[np.ndarray, " C"]) -> Float[np.ndarray, " C"]:
     """Standard deviation of the residual, not below that of rounding: in a black channel that of the brightest one."""
     degrees = np.maximum(_degrees(optimum), 1)
-    least = np.max(optimum.square / degrees) * np.finfo(float).eps ** 2 + np.finfo(float).tiny
+    least = np.max(optimum.square / degrees) * np.finfo(float).eps ** 2 + TINY
     return np.sqrt(np.maximum(optimum.cost / degrees, np.maximum(rounding**2, least)))
 
 
@@ -192,10 +193,11 @@ def uncertainty(
     deviations = np.sqrt(np.maximum([variance, own], 0.0))
     reaches = [student_95(max(one, FEWEST_DEGREES)) for one in degrees.tolist()]
     x_error, x_interval = np.full(x.shape, np.inf), np.zeros((*x.shape, 2))
-    # As much of each coefficient as an error of all pixels alike, as large as the picture, may make; of a highlight as
-    # much as its brightest place may.
-    picture = SHARED * np.sqrt(np.diag(inner.inverse)[:-1].reshape(x.shape) * optimum.square)
-    of_lobe = resolution / max(visible, resolution, np.finfo(float).tiny)
+    # What arithmetic leaves of a coefficient: as much as an error of all pixels alike, as large as the picture, may
+    # make; of a highlight as much as its brightest place may.
+    alike = SHARED * np.sqrt(np.diag(inner.inverse)[:-1].reshape(x.shape) * optimum.square)
+    arithmetic, of_lobe = resolution * np.maximum(x, alike), resolution / max(visible, resolution, TINY)
+    arithmetic[2] = SHARED * of_lobe * x[2]
     x_interval[..., 1] = np.inf
     for term, channel in np.argwhere(determined):
         index = term * channels + channel
@@ -206,8 +208,7 @@ def uncertainty(
         if (term, channel) in at_bound:
             value, deviation, alone, _ = at_bound[term, channel]
         largest = max(optimum.square[channel], brightest[channel] ** 2)
-        rounding = SHARED * value * of_lobe if term == 2 else resolution * max(value, picture[term, channel])
-        deviation = math.hypot(deviation, rounding)
+        deviation = math.hypot(deviation, arithmetic[term, channel])
         wide = deviation * reaches[channel] / NORMAL_95
         x_interval[term, channel], x_error[term, channel] = above_zero(value, wide), deviation
         # What is at its bound may be there, whatever the slope of a likelihood that is nearly flat.
@@ -273,7 +274,7 @@ def _covariance(
         middles[0] = scatter + LEAST_SCATTER * middle
         covariance = inverse @ middles[0] @ inverse * np.outer(widening, widening)
         # Of a few blocks the scatter alone says too little.
-        more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ middle), np.finfo(float).tiny), 1.0)
+        more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ middle), TINY), 1.0)
         variance, least = np.diag(covariance), np.diag(independent) * more
         wider = np.sqrt(np.maximum(quotient(least, variance), 1.0))
         covariance = covariance * np.outer(wider, wider)
@@ -365,7 +366,7 @@ def _of_scores(optimum: Optimum, pixels: PixelErrors) -> Float[np.ndarray, "U U"
     if pixels.channels is not None:
         # The columns of two channels are alike but for their sizes, or nearly so: by the root of each one's products
         # what they share is never more than either has.
-        size = np.sqrt(np.maximum(np.diagonal(scores, axis1=1, axis2=2), np.finfo(float).tiny))
+        size = np.sqrt(np.maximum(np.diagonal(scores, axis1=1, axis2=2), TINY))
         values, vectors = np.linalg.eigh(scores / (size[:, :, None] * size[:, None]))
         roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2) * size[..., None]
         scores = (roots[:, None] @ np.swapaxes(roots, 1, 2)) * pixels.channels[..., None, None]

@@ -131,7 +131,8 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     correlation = errors.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
     warnings += _warnings(statistics.neighbours, together, None if all(errors.reasons[2]) else lobe)
-    # What the camera says of a pixel's brightness may be off in a channel of strong colour, and no loss knows all.
+    # What the camera says of a pixel's brightness may be off in a channel of strong colour; by shares pixels weigh as
+    # they were chosen to.
     told = observed.problem.noise is not None or observed.problem.loss in RELATIVE
     if growing is not None and not told and not any("structure" in text for text in warnings):
         warnings.append(

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from brdf.precision import cast
+from fitting.channel_errors import residuals
 from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.normal_equations import AnyArray, Picture, Sums, sums
 from fitting.solver.profile import Optimum
@@ -198,5 +199,4 @@ def _residual_value_weight(
     some = picture.in_double(pixel)
     weight = np.broadcast_to(weight, (len(picture.target), weight.shape[1]))[pixel] * (some.weights > 0)[: pixel.size]
     shown = np.asarray(some.predict(optimum.n, optimum.x), float)
-    left = np.where(some.weights > 0, some.target - shown, 0.0) * np.sqrt(some.weights)
-    return left[: pixel.size].T, shown[: pixel.size].T, np.asarray(weight, float).T
+    return residuals(some, optimum)[: pixel.size].T, shown[: pixel.size].T, np.asarray(weight, float).T
