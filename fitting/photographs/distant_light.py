@@ -198,26 +198,15 @@ def light_from_shading(
     row, column = pixel.T
     normal, value = np.asarray(points.normal, np.float64)[row, column].T.copy(), grey[row, column]
     unit = float(np.max(value, initial=0.0))
-    lit = value > BRIGHT * unit
-    if np.count_nonzero(lit) < FEWEST:
+    if np.count_nonzero(value > BRIGHT * unit) < FEWEST:
         raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
     value = value / unit
-    numbers, mirror, lit, scale = _fitted(value, normal, ambient)
+    found = _fitted(value, normal, ambient)
     if clipped.any():
-        # Of pixels near the level those are left that noise made darker: out goes what is predicted there.
-        channels, within = values[row, column].T / unit, np.ones(len(value), bool)
-        channel = max(channels, key=np.mean)
-        for _ in range(LIMITING_ROUNDS):
-            shown, among = _shown(numbers, mirror, normal)[0], np.flatnonzero(within)[lit]
-            shown *= np.mean(channel[among]) / np.mean(value[among])
-            noise = DEVIATION * np.median(np.abs(channel - shown)[among])
-            before, within = within, shown < level / unit - REACH * noise
-            # Else noise reaches from the level into the dark.
-            if np.array_equal(before, within) or np.count_nonzero(within & (value > BRIGHT)) < FEWEST:
-                within = before
-                break
-            numbers, mirror, lit, scale = _fitted(value[within], normal[:, within], ambient)
+        brightest = max(values[row, column].T / unit, key=np.mean)
+        within, found = _below(level / unit, brightest, value, normal, ambient, found)
         value, normal, pixel = value[within], normal[:, within], pixel[within]
+    numbers, mirror, lit, scale = found
     pixel -= pixel.min(axis=0)
     block = (pixel // -(-(pixel.max() + 1) // BLOCKS) @ [BLOCKS, 1])[lit]
     shown, slopes = _shown(numbers, mirror, normal[:, lit])
@@ -238,6 +227,25 @@ def light_from_shading(
         noise = (CUT_NOISE + 3 / count**0.5) * DEVIATION * np.median(np.abs(residual))
         elsewhere = max(np.mean(value[away]) - (numbers[3] if ambient else 0.0) - noise, 0.0) / length
     return ShadingLight(numbers[:3] / length, length * unit, error, unexplained, float(elsewhere))
+
+
+def _below(level, channel, value, normal, ambient, found) -> tuple[np.ndarray, tuple]:
+    """Which pixels are predicted below a level of a channel, and what `_fitted` says of these.
+
+    Of pixels near the level the ones that do not reach it are those that noise made darker.
+    """
+    within = np.ones(len(value), bool)
+    for _ in range(LIMITING_ROUNDS):
+        numbers, mirror, lit, _ = found
+        shown, among = _shown(numbers, mirror, normal)[0], np.flatnonzero(within)[lit]
+        shown *= np.mean(channel[among]) / np.mean(value[among])
+        noise = DEVIATION * np.median(np.abs(channel - shown)[among])
+        inside = shown < level - REACH * noise
+        # Where few are left noise reaches from the level into the dark.
+        if np.array_equal(inside, within) or np.count_nonzero(inside & (value > BRIGHT)) < FEWEST:
+            break
+        within, found = inside, _fitted(value[inside], normal[:, inside], ambient)
+    return within, found
 
 
 def _fitted(value, normal, ambient) -> tuple[np.ndarray, bool, np.ndarray, float]:
