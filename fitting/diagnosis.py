@@ -121,7 +121,8 @@ def diagnose(result: FitResult) -> tuple[Cause, ...]:
     for ball, scene, counted in zip(balls, result.scenes, result.counted, strict=True):
         smaller = dataclasses.replace(ball, radius=ball.radius * INNER)
         masks.append(counted & np.asarray(dataclasses.replace(scene, shapes=(smaller,)).surface_points().mask))
-    problem = state_problem(list(result.targets), list(result.scenes), masks, model=type(result.material).name)
+    about = list(result.targets), list(result.scenes), masks
+    problem = state_problem(*about, rounding=0, model=type(result.material).name)
     try:
         found = _causes(dataclasses.replace(fit_pictures(problem), files=result.files))
     except InputError:  # next to nothing is left
@@ -197,8 +198,8 @@ class _Picture:
             self.moves[f"intensity{which}"] = [{f"{leaf}.{field}": np.asarray(light.emittance) / 100}]
         if camera is not None and ball is not None:
             width, height = camera.resolution
-            rays = camera.rays(np.array([0.0, 1.0, 0.0]) + width / 2, np.array([0.0, 0.0, 1.0]) + height / 2)
-            origin, direction = (np.asarray(part.stacked(), np.float64) for part in rays)
+            corners = np.array([0.0, 1.0, 0.0]) + width / 2, np.array([0.0, 0.0, 1.0]) + height / 2
+            origin, direction = (np.asarray(part, np.float64) for part in _rays(camera, *corners))
             far = origin + direction * np.linalg.norm(np.asarray(ball.center) - np.asarray(camera.position))
             pixels = far[1:] - far[0]
             self.moves["ball"] = [{"shapes[0].center": pixel} for pixel in pixels]
@@ -291,6 +292,11 @@ class _Picture:
     def curve(self, values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
         """The derivative of the codes by the values."""
         return (self.codes(values + CURVED) - self.codes(values - CURVED)) / (2 * CURVED)
+
+
+@eqx.filter_jit
+def _rays(camera: Any, column: Any, row: Any) -> list[Any]:
+    return [part.stacked() for part in camera.rays(column, row)]
 
 
 @eqx.filter_jit

@@ -28,13 +28,17 @@ from jaxtyping import Array, Float
 import brdf
 from brdf.checks import instance
 from brdf.precision import working_precision
+from brdf.rendering import basis_columns
 from fitting.joint_problem import QUICKLY_COMPILED, Picture, chosen_leaves, residuals
 from fitting.progress import waiting
 from fitting.result import FitResult, of_material_alone
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
+from fitting.solver.tied import join_channels
 from fitting.uncertainty.intervals import widened
 
 NEWTON_STEPS = 3
+# Of each picture: an error of an error is no concern.
+MOST_PIXELS = 1 << 14
 # Of the largest eigenvalue of the Hessian: a smaller one determines nothing.
 DEPENDENT = 1e-13
 
@@ -169,15 +173,39 @@ def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
     """A fit whose errors hold those of its lights, to first order and as if they were independent of the picture's.
 
     Of pictures under one distant light each, whose direction has a standard error in degrees, the root mean square of
-    the angle; refused where the fit does not determine how its numbers move.
+    the angle. What the turns of a light change of its picture the numbers follow by least squares, as far as some
+    pixels tell; refused where these do not determine the numbers.
     """
-    found = sensitivity(result, lambda scenes: [scene.lights[0].direction for scene in scenes])
-    variance = np.zeros(len(result.parameters))
-    for scene, moves, error in zip(result.scenes, found, degrees, strict=True):
-        direction = np.asarray(scene.lights[0].direction, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
-        # Two small turns of it share the angle; it does not matter how long it is.
-        turns = np.linalg.svd(direction[None])[2][1:] * np.linalg.norm(direction) * math.radians(error) / math.sqrt(2)
-        for index, one in enumerate(result.parameters):
-            slope = getattr(moves, one.name)
-            variance[index] += np.sum((turns @ (slope if one.channel is None else slope[one.channel])) ** 2)
-    return dataclasses.replace(result, parameters=tuple(map(widened, result.parameters, np.sqrt(variance).tolist())))
+    own, channels = _unknowns(result), result.material.k_d.size
+    unknowns = np.zeros((len(own), 3 * channels + 1))  # Lambert's law has no highlight
+    unknowns[:, : own.shape[1]] = own
+    names = "k_a", "k_d", "k_s"
+    coefficients = np.array([getattr(result.material, name, np.zeros(channels)) for name in names], np.float64)
+    gram, products = np.zeros((channels, 4, 4)), []
+    with working_precision("float64"), waiting("differentiating the fit"):
+        material = brdf.cast(result.material, "float64")
+        for index, error in enumerate(degrees):
+            pixel, weight = np.flatnonzero(result.counted[index]), result.weighed[index]
+            some = pixel[np.linspace(0, pixel.size - 1, min(pixel.size, MOST_PIXELS)).astype(int)]
+            scene = brdf.some_pixels(result.scenes[index], some, precision="float64")
+            shown = _columns(material, scene, np.zeros(3))
+            weighted = shown * weight.reshape(result.counted[index].size, -1)[some] * (pixel.size / some.size)
+            gram += np.einsum("ipc,jpc->cij", weighted, shown)
+            direction = np.asarray(scene.lights[0].direction, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
+            # Two small turns of it share the angle; it does not matter how long it is.
+            length = np.linalg.norm(direction) * math.radians(error) / math.sqrt(2)
+            for turn in np.linalg.svd(direction[None])[2][1:] * length:
+                change = (_columns(material, scene, turn) - _columns(material, scene, -turn))[:3] / 2
+                products.append(np.einsum("ipc,jpc,jc->ci", weighted, change, coefficients))
+    joined = [join_channels(gram, product, np.zeros(channels), coefficients[2]) for product in products]
+    inverse = unknowns.T @ _inverse(unknowns @ joined[0].gram @ unknowns.T) @ unknowns
+    off = np.linalg.norm([inverse @ one.product for one in joined], axis=0).tolist()
+    parameters = tuple(widened(one, off[one.place(channels)]) for one in result.parameters)
+    return dataclasses.replace(result, parameters=parameters)
+
+
+def _columns(material: brdf.Material, scene: brdf.Scene, turn: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 P C"]:
+    """What each coefficient, and the exponent but for a factor, moves of some pixels, the light turned."""
+    light: Any = scene.lights[0]
+    light = dataclasses.replace(light, direction=np.asarray(light.direction, np.float64) + turn)
+    return np.asarray(basis_columns(material, dataclasses.replace(scene, lights=(light,))))[:, 0]

@@ -29,10 +29,10 @@ NAMES: dict[Any, str] = {"linear": "linear", "srgb": "sRGB"}
 
 
 def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how: Any) -> tuple["FitResult", FitInputs]:
-    """Read and fit, where a file does not say how it is encoded under both interpretations.
+    """Read and fit, where a file does not say how it is encoded under that of two interpretations which explains it.
 
     ``read`` gives the inputs, also with other encodings by file, ``say`` tells what is being done, and ``how`` are
-    further arguments of `fitting.fit`; seconds are shared by the two fits.
+    further arguments of `fitting.fit`; seconds are shared by the trials and the fit.
 
     Returns:
         The fit to keep, with a warning where the encoding is a guess or was changed; and what was fitted.
@@ -45,22 +45,25 @@ def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how
         return _fit(inputs, how), inputs
     path, assumed = next(iter(inputs.silent.items()))
     if how["seconds"] is not None and how["seconds"] > 0:  # or the fit says what is wrong with it
-        how["seconds"] /= 2
-    say(f"{what} as {NAMES[assumed]}")
-    result = _fit(inputs, how)
-    say(f"{what} as {NAMES[OTHER[assumed]]}")
+        how["seconds"] /= 3
+    # What rounding did to either is of no account beside a wrong curve.
+    plainly = how | {"rounding": 0}
+    say(f"trying {NAMES[assumed]} and {NAMES[OTHER[assumed]]}")
+    warning, trial = "", _fit(inputs, plainly)
     try:
         others = read({path: OTHER[encoding] for path, encoding in inputs.silent.items()})
-        other = _fit(others, how)
+        other = _fit(others, plainly)
     except InputError:
-        return result, inputs  # under the other encoding it cannot be fitted at all
-    # To be compared where both count: each leaves out what under its own encoding is cut off.
-    both = [mine & its for mine, its in zip(result.counted, other.counted, strict=True)]
-    both = both if all(counted.any() for counted in both) else None
-    shares = [_unexplained(fit, its, both or fit.counted) for fit, its in ((result, inputs), (other, others))]
-    is_other, warning = judge(assumed, *shares)
-    if is_other:
-        result, inputs = other, others
+        pass  # under the other encoding it cannot be fitted at all
+    else:
+        # To be compared where both count: each leaves out what under its own encoding is cut off.
+        both = [mine & its for mine, its in zip(trial.counted, other.counted, strict=True)]
+        both = both if all(counted.any() for counted in both) else None
+        shares = [_unexplained(fit, its, both or fit.counted) for fit, its in ((trial, inputs), (other, others))]
+        is_other, warning = judge(assumed, *shares)
+        inputs = others if is_other else inputs
+    say(what)
+    result = _fit(inputs, how)
     warnings = [f"{path.name} does not say how its values are encoded: {warning}"] if warning else []
     return dataclasses.replace(result, warnings=(*result.warnings, *warnings)), inputs
 

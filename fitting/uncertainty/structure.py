@@ -202,7 +202,10 @@ def scatter(
     """
     total = 0.0
     for picture, own in zip(pictures, errors, strict=True):
-        slopes = picture.columns(optimum.n) * np.sqrt(np.asarray(picture.weights))
+        weights = np.broadcast_to(np.asarray(picture.weights), own.values.shape)
+        counts = np.flatnonzero(np.any(weights > 0, axis=1))
+        own = own._replace(values=own.values[counts], pixel=own.pixel[counts])
+        slopes = picture.columns(optimum.n)[:, counts] * np.sqrt(weights[counts])
         slopes[3] *= optimum.x[2]
         terms = slopes * own.values
         by_x = np.moveaxis(terms[:3], -1, 1).reshape(-1, terms.shape[1])
@@ -242,7 +245,8 @@ def _left_out(
 ) -> Float[np.ndarray, "U B"]:
     """Scores of blocks, each about the fit without it."""
     own = np.array([covariance[np.ix_(some, some)] for some in index])
-    held = np.einsum("ipc,cij,jpc->p", slopes, own, slopes, optimize=True)
+    apart = np.moveaxis(slopes, 2, 0)
+    held = np.sum(apart * (own @ apart), axis=(0, 1))
     root = np.linalg.svd(covariance, hermitian=True)
     root = root.U * np.sqrt(root.S)
     found = together.copy()
