@@ -224,23 +224,30 @@ class Precision(NamedTuple):
         information: logarithm of the determinant of the Hessian.
         variance: of each, (U,).
         values: how many tell of it, by their share in the Hessian, (U,).
+        by_log_noise: derivative of the likelihood by log s.
     """
 
     noise: float
     information: float
     variance: Float[np.ndarray, " U"]
     values: Float[np.ndarray, " U"]
+    by_log_noise: float
 
 
 def maximise(
-    problem: Problem, start: Estimate, enough: float = ENOUGH_KNOWN, least: float = 0.0
+    problem: Problem,
+    start: Estimate,
+    enough: float = ENOUGH_KNOWN,
+    least: float = 0.0,
+    earlier: Sequence[Precision] = (),
 ) -> tuple[Estimate, list[Precision], Score]:
     """The most likely unknowns and noise, what was known of the unknowns with more noise, and what the values say.
 
     The noise of the start is not much too small. It is known well enough where its step is no larger than the factor
-    ``enough``; that of which fewer values than ``least`` tell of a number is not gone below.
+    ``enough``; that of which fewer values than ``least`` tell of a number is not gone below. ``earlier`` is what some
+    of the same values knew, from much noise to that of the start.
     """
-    at, precisions, before, low, high = start, [], None, -math.inf, math.inf
+    at, precisions, low, high = start, [], -math.inf, math.inf
     while True:
         values = problem.near(problem.codes(at.unknowns), REACH * at.noise)
         at, values, score = _climb(problem, at, ROUGH_GAIN, precisions, values, problem.score(at, values))
@@ -252,8 +259,10 @@ def maximise(
         now, derivative = math.log(at.noise), score.by_log_noise
         low, high = (max(low, now), high) if derivative > 0 else (low, min(high, now))
         # By the last two scores, of which one takes the place of the other; at first by what is known of the noise.
-        slope = -score.noise_information if before is None else (derivative - before[1]) / (now - before[0])
-        step, before = -derivative / slope if slope < 0 else math.copysign(math.inf, derivative), (now, derivative)
+        slope, last = -score.noise_information, (precisions if len(precisions) > 1 else earlier)[-2:]
+        if len(last) > 1:
+            slope = (last[1].by_log_noise - last[0].by_log_noise) / math.log(last[1].noise / last[0].noise)
+        step = -derivative / slope if slope < 0 else math.copysign(math.inf, derivative)
         step = min(max(step, -largest, math.log(LEAST_NOISE) - now), largest)
         if not low <= now + step <= high:
             step = 0.5 * (low + high) - now
@@ -262,8 +271,8 @@ def maximise(
         at = at._replace(noise=math.exp(now + step))
     rough = score
     at, _, score = _climb(problem, at, LEAST_GAIN, precisions, values, rough)
-    last = precisions[-1] if score is rough else precision(problem, at, score)
-    return at, [*(entry for entry in precisions if entry.noise > at.noise), last], score
+    found = precisions[-1] if score is rough else precision(problem, at, score)
+    return at, [*(entry for entry in precisions if entry.noise > at.noise), found], score
 
 
 def _climb(
@@ -323,7 +332,7 @@ def precision(problem: Problem, at: Estimate, score: Score) -> Precision:
     relative = quotient(influence, own[:, None])
     total = np.einsum("uv,vw,uw->u", relative, score.hessian, relative)
     squares = problem.squared_shares(score, relative)
-    return Precision(at.noise, information, np.diag(influence), quotient(total**2, squares))
+    return Precision(at.noise, information, np.diag(influence), quotient(total**2, squares), score.by_log_noise)
 
 
 def most_informative(precisions: Sequence[Precision]) -> Precision:

@@ -190,7 +190,7 @@ def _near_edges(fit: ModelFit, at: Estimate, rival: float = -math.inf) -> Eviden
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=most_informative(precisions).noise)
         problem = separable(_gathered(pictures, at))
-        at, precisions, score = maximise(problem, at)
+        at, precisions, score = maximise(problem, at, earlier=precisions)
     rounds = [(problem, precisions)]
     while len(rounds) <= MOST_ROUNDS and (factors := _more_noise(score, at.noise, fit.owner)).any():
         pixels = [_noisier(values, math.exp(factor)) for values, factor in zip(problem.pixels, factors, strict=True)]

@@ -6,19 +6,37 @@ makes a result takes the class from here, and a pickled one names the package, w
 
 from typing import Any
 
-from fitting.diagnosis import diagnose
-from fitting.report import html, saving, text, viewer
-from fitting.result import REPORTS, FitResult
+from fitting.report import saving, text
+from fitting.result import REPORTS, Cause, FitResult
 
 __all__ = ["FitResult"]
 
 
+# What is drawn, or asked for now and then, is loaded where it is.
 def _plot(result: FitResult, picture: int | None) -> Any:
-    from fitting.report.plots import comparison  # Matplotlib takes long to load
+    from fitting.report.plots import comparison
 
     return comparison(result, picture)
 
 
-REPORTS |= {"text": text.report, "html": html.result_html, "save": saving.save, "plot": _plot, "view": viewer.view}
-REPORTS["diagnose"] = diagnose
+def _html(result: FitResult) -> str:
+    from fitting.report.html import result_html
+
+    return result_html(result)
+
+
+def _view(result: FitResult, picture: int | None) -> Any:
+    from fitting.report.viewer import view
+
+    return view(result, picture)
+
+
+def _diagnose(result: FitResult) -> tuple[Cause, ...]:
+    from fitting.diagnosis import diagnose
+
+    return diagnose(result)
+
+
+REPORTS |= {"text": text.report, "save": saving.save, "html": _html, "plot": _plot, "view": _view}
+REPORTS["diagnose"] = _diagnose
 FitResult.__module__ = "fitting"
