@@ -338,6 +338,12 @@ def _sought_again(stated: FitProblem, solved: _Solved, solve: Callable[..., _Sol
     return solved
 
 
+@jax.jit
+def _within(vector: Array, of_n: Array, bounded: Array) -> Array:
+    """Freed numbers, none beyond its bound."""
+    return jnp.where(of_n, jnp.clip(vector, *np.log(N_RANGE)), jnp.where(bounded & (vector < 0), 0, vector))
+
+
 def _residuals(free: Array, given: tuple[JointProblem, Array, Array]) -> Array:
     problem, vector, held = given
     return problem.residuals(jnp.where(held, vector, free))
@@ -376,7 +382,7 @@ def _minimum(
     # Steps that rounding hides the gains of are tried for ever: it is asked several times.
     each = max(FEWEST_STEPS, -(-max_steps // ROUNDS)) if solver == "lm" else max_steps
     bounded, held = problem.each(lambda leaf: leaf.bounded), np.zeros(vector.shape, bool)
-    of_n, ends = problem.each(lambda leaf: leaf.name == "n"), np.log(N_RANGE)
+    of_n = problem.each(lambda leaf: leaf.name == "n")
     steps, converged, near, least, best = 0, False, whole, np.inf, problem
     of_k_s = problem.each(lambda leaf: leaf.name == "k_s")
     lobes = bool(of_n.any() and of_k_s.any())
@@ -384,7 +390,7 @@ def _minimum(
     stepped, astray = whole, False
     for trial in range(ROUNDS * (2 + whole)):
         whole = whole and trial < ROUNDS
-        vector = jnp.where(of_n, jnp.clip(vector, *ends), jnp.where(bounded & (vector < 0), 0, vector))
+        vector = _within(vector, of_n, bounded)
         # Turns from here on are those of what was found.
         problem = problem.at(vector)
         vector = problem.start()

@@ -8,7 +8,6 @@ import operator
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,8 +19,6 @@ from fitting.maximum_likelihood import FAINT, FIRST_NOISE, LIKELIER
 from fitting.pixels import Observed
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
 from fitting.uncertainty.structure import Errors, block_scatter
-
-_residuals = eqx.filter_jit(JointProblem.residuals)
 
 # Of the largest eigenvalue of the normal equations: a smaller one determines nothing.
 DEPENDENT = 1e-12
@@ -122,8 +119,11 @@ class _RoundedPictures(Problem):
     """Rounded pictures, and the freed numbers that move what they show."""
 
     def __init__(self, problem: JointProblem, bounds: Sequence[Bounds], observed: Observed):
-        # What is left of pictures that are black is what the renderer shows.
-        black = [(jnp.zeros_like(target), None) for target, _ in problem.pictures]
+        # What is left of pictures that are black is what the renderer shows; by the program that makes residuals.
+        black = [
+            (np.zeros_like(target), None if weight is None else np.ones_like(weight))
+            for target, weight in problem.pictures
+        ]
         self._problem = dataclasses.replace(problem, pictures=black)
         self.bounds, self.copies, self.lossy = bounds, observed.copies, any(own.lossy for own in bounds)
         bounded, self.exponents = problem.each(lambda leaf: leaf.bounded), problem.each(lambda leaf: leaf.name == "n")
@@ -138,7 +138,7 @@ class _RoundedPictures(Problem):
 
     def radiance(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
         """What is predicted."""
-        return self._problem.by_picture(_residuals(self._problem, jnp.asarray(unknowns)))
+        return self._problem.by_picture(self._problem.residuals(jnp.asarray(unknowns)))
 
     def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
         """What is predicted, and its derivatives by all numbers."""

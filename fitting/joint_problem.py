@@ -96,10 +96,12 @@ class JointProblem(eqx.Module):
         """What is so of the leaf that each number belongs to."""
         return np.concatenate([np.full(leaf.numbers.stop - leaf.numbers.start, of(leaf)) for leaf in self.freed])
 
+    @eqx.filter_jit
     def start(self) -> Array:
         """The freed numbers."""
         return jnp.concatenate([leaf.of(self.leaves[leaf.position]) for leaf in self.freed])
 
+    @eqx.filter_jit
     def at(self, vector: Array) -> "JointProblem":
         """The problem with other freed numbers; directions turn from there."""
         moved = [leaf.at(self.leaves[leaf.position], vector[leaf.numbers]) for leaf in self.freed]
@@ -109,6 +111,7 @@ class JointProblem(eqx.Module):
         """Material and scenes."""
         return jax.tree.unflatten(self.shape, self.leaves)
 
+    @eqx.filter_jit
     def residuals(self, vector: Array) -> Array:
         """Weighted residuals of all pictures, one after the other."""
         return residuals(*self.at(vector).content(), self.pictures)
@@ -198,7 +201,7 @@ def named_leaves(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list
     def leaves(material: Any, scenes: list[brdf.Scene]) -> list[Any]:
         found = [material.k_d] if any(scene.lights for scene in scenes) else []
         found += [material.k_a] if any(scene.ambient is not None for scene in scenes) else []
-        found += [material.k_s, material.n] if np.any(getattr(material, "k_s", 0.0)) else []
+        found += [material.k_s, material.n] if np.any(np.asarray(getattr(material, "k_s", 0.0))) else []
         for match in filter(None, asked):
             index, picture = (None if part is None else int(part) for part in match.groups()[1:])
             # Of all intensities that of the first light is the unit of the material.

@@ -77,9 +77,7 @@ class Material(Checked):
         Returns:
             (..., C), at least 0; 0 where either direction is not above the horizon.
         """
-        to_light, to_view = jnp.asarray(to_light), jnp.asarray(to_view)
-        above = (to_light[..., 2] > 0) & (to_view[..., 2] > 0)
-        return jnp.where(above[..., None], self._albedo(to_light, to_view), 0.0) / math.pi
+        return _reflectance(self, jnp.asarray(to_light), jnp.asarray(to_view))
 
     def _albedo(self, to_light: Array, to_view: Array) -> Any:
         """Pi times the BRDF above the horizon."""
@@ -89,6 +87,12 @@ class Material(Checked):
         """For Jupyter: a lit sphere and the numbers; nothing while JAX traces them."""
         traced = any(isinstance(value, Tracer) for value in vars(self).values())
         return None if traced else formatters.html["material"](self)
+
+
+@jax.jit
+def _reflectance(material: Material, to_light: Array, to_view: Array) -> Array:
+    above = (to_light[..., 2] > 0) & (to_view[..., 2] > 0)
+    return jnp.where(above[..., None], material._albedo(to_light, to_view), 0.0) / math.pi
 
 
 class SpecularMaterial(Material):

@@ -8,8 +8,8 @@
 """
 
 import dataclasses
+from typing import Any
 
-import jax
 import numpy as np
 
 from brdf.albedo import ACCURACY, WITH_CLOSED_FORM, directional_albedo, normalized_form
@@ -53,10 +53,7 @@ def check_material(material: Material, subject: str) -> Report:
 def _in_plane(material: Material, light: np.ndarray, view: np.ndarray) -> np.ndarray:
     """f_r, (a, b, C), for angles of light and view in degrees, in one plane: there the five models have extremes."""
     to_light, to_view = (from_angles(np.radians(angle), 0.0) for angle in (light, view))
-    return np.asarray(_reflectance(material, to_light[:, None], to_view))
-
-
-_reflectance = jax.jit(lambda material, to_light, to_view: material.reflectance(to_light, to_view))
+    return np.asarray(material.reflectance(to_light[:, None], to_view))
 
 
 def _positivity(material: Material) -> Finding:
@@ -92,25 +89,28 @@ def _reciprocity(material: Material, classic: bool) -> Finding:
 
 
 def _energy(material: Material, classic: bool) -> Finding:
+    def reflected(angle: Any) -> np.ndarray:
+        return np.asarray(directional_albedo(material, angle))
+
     within, beyond = 0.0, 0.5 * np.pi
     for _ in range(9 * classic):  # closer each time: the last angle of the light at which the albedo is within 1
         angles = np.linspace(within, beyond, 101)
-        last = np.max(np.flatnonzero(np.max(directional_albedo(material, angles), axis=1) <= 1.0), initial=0)
+        last = np.max(np.flatnonzero(np.max(reflected(angles), axis=1) <= 1.0), initial=0)
         within, beyond = angles[last], angles[last + 1]
     crossing = float(np.degrees(within))
     worst = max(GRAZING, 90.0 - 0.1 * (90.0 - crossing)) if classic else 0.0
     angle, light = np.radians(worst), Angles(worst)
-    albedo = np.asarray(directional_albedo(material, angle))
+    albedo = reflected(angle)
     channel = int(np.argmax(albedo))
     value, named = float(albedo[channel]), in_channel(channel, albedo.size)
     # towards 90 degrees the cosine knows the rounding of the angle
     bound = (_ROUNDING + np.finfo(float).eps * angle / np.cos(angle)) * abs(value)
     if isinstance(material, SpecularMaterial):
-        divisor = normalized_form(type(material)).scale(material.n) * np.cos(angle) if classic else 1.0
-        bound += ACCURACY["float64"] * material.k_s[channel] / divisor
+        divisor = normalized_form(type(material)).scale(float(material.n)) * np.cos(angle) if classic else 1.0
+        bound += ACCURACY["float64"] * np.asarray(material.k_s)[channel] / divisor
     words = f"the largest albedo is {value:.7g}, for light at {light}"
     if classic and np.asarray(material.k_s)[channel] > 0:
-        first = int(np.argmax(directional_albedo(material, beyond)))
+        first = int(np.argmax(reflected(beyond)))
         where = "" if first == channel else f"{in_channel(first, albedo.size)},"
         words = f"the albedo exceeds 1 for light beyond {Angles(crossing)}{where} and grows without bound"
         if value > ENERGY_LIMIT + bound:
