@@ -4,7 +4,7 @@
 | --- | --- | --- |
 | integer files, arrays | as stored, in steps as the codes used show (12 bits may stand in 16) | half a step around |
 | half floats | the values | half a unit in the last place around |
-| RGBE (.hdr) | the values; channels share an exponent | up to a step above: the format truncates |
+| RGBE (.hdr) | the mantissas; channels share an exponent | up to a step above: the format truncates |
 | float32 | none | where it is |
 
 The largest code of an integer picture has no upper bound and 0 no lower one: that is clipping and cut-off noise.
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt
 
 from brdf.errors import InputError
-from brdf.images.encoding import Encoding, decode, encode
+from brdf.images.encoding import Encoding, decode, encode, rgbe_step
 from brdf.images.jpeg import Jpeg
 from fitting.likelihood import AnyArray, Bounds
 
@@ -303,20 +303,20 @@ def _levels(pixels: np.ndarray, *, half: bool) -> Codes | None:
         fitting = [(top, curve) for top in _TOLERANCE for curve in _CURVES if _on_levels(some, curve, top)]
         with np.errstate(over="ignore", under="ignore"):
             halves = bool(np.all(some == some.astype(np.float16)))
-        rgbe = every > 1 or _is_rgbe(pixels)
+        rgbe = pixels if every > 1 else _mantissas(pixels)
         whole = some.max() > 1 and some.max() <= max(_TOLERANCE) and bool(np.all(some == np.rint(some)))
-        if not (fitting or halves or rgbe or whole):
+        if not (fitting or halves or rgbe is not None or whole):
             return None
     if all(np.unique(values).size < _FEWEST for values in (some[::stride], some)):
         if not half:
             return None
-        fitting, rgbe, whole = [], False, False
+        fitting, rgbe, whole = [], None, False
     for top, curve in fitting:
         found = _integers(_nearest_codes(pixels, curve, top), curve, top, _FEWEST)
         if found is not None:
             bits = int(np.ceil(np.log2(found.ends[1] + 1)))
             return found._replace(levels=f"{bits}-bit {'sRGB' if curve == 'srgb' else curve} files")
-    if whole and (some.max() <= min(_TOLERANCE) or not (rgbe or halves)):
+    if whole and (some.max() <= min(_TOLERANCE) or (rgbe is None and not halves)):
         # Codes that nobody divided by the largest; those of half floats and RGBE are whole only where they are bright.
         top = min(top for top in _TOLERANCE if some.max() <= top)
         found = _integers(_nearest_codes(pixels / top, "linear", top), "linear", top, _FEWEST)
@@ -326,14 +326,14 @@ def _levels(pixels: np.ndarray, *, half: bool) -> Codes | None:
         ends = found.ends if top == min(_TOLERANCE) else (found.ends[0], np.inf)
         return found._replace(unit=float(top), ends=ends, levels="whole numbers")
     # A float's 0 is no end of its own, but noise may have been cut off there.
-    images = np.moveaxis(pixels, -1, 0)
+    images = np.moveaxis(pixels if rgbe is None else rgbe, -1, 0)
     cut = any(single_values_at_end(image, np.isfinite(image), 0.0) for image in images)
     ends = (0.0 if cut else -np.inf, np.inf)
-    if rgbe:
-        step = np.broadcast_to(_shared_step(pixels)[..., None], pixels.shape)
+    if rgbe is not None:
+        step = rgbe_step(pixels)
         unit = float(np.median(step[step > 0]))
-        above = np.maximum(step, 1e-30) / unit
-        return Codes((pixels / unit).astype(np.float32), 0.0, above, ends, 1 / unit, "linear", levels="RGBE files")
+        above = np.broadcast_to(np.maximum(step, 1e-30) / unit, pixels.shape)
+        return Codes((rgbe * above).astype(np.float32), 0.0, above, ends, 1 / unit, "linear", levels="RGBE files")
     if halves:
         known = np.where(np.isfinite(pixels), np.maximum(pixels, 6e-5), 1.0)
         ulp = np.spacing(known.astype(np.float16)).astype(np.float64)
@@ -348,15 +348,13 @@ def _on_levels(values: np.ndarray, curve: Encoding, top: int) -> bool:
     return bool(np.all(codes <= top + 0.5) and np.all(np.abs(codes - np.rint(codes)) < _TOLERANCE[top]))
 
 
-def _shared_step(pixels: np.ndarray) -> np.ndarray:
-    """The step of RGBE: the brightest channel takes 128 to 255 of them."""
-    largest = np.max(np.nan_to_num(pixels), axis=-1)
-    return np.where(largest > 0, np.exp2(np.floor(np.log2(np.where(largest > 0, largest, 1.0))) - 7), 0.0)
-
-
-def _is_rgbe(pixels: np.ndarray) -> bool:
+def _mantissas(pixels: np.ndarray) -> np.ndarray | None:
+    """Of the values of an RGBE file, half a step above them or, as many programs read it, as they are; else None."""
     if pixels.shape[-1] != 3 or not np.all(np.isfinite(pixels)):
-        return False
-    step = _shared_step(pixels)[..., None]
+        return None
+    step = rgbe_step(pixels)
+    if not np.any(step > 0):
+        return None
     codes = pixels / np.where(step > 0, step, 1.0)
-    return bool(np.any(step > 0) and np.all(codes == np.rint(codes)))
+    whole = np.floor(codes)
+    return whole if np.all(codes == whole) or np.all((codes == whole + 0.5) | (step == 0)) else None

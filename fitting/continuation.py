@@ -340,19 +340,30 @@ def most_informative(precisions: Sequence[Precision]) -> Precision:
 
     With less noise all pixels of a small highlight may lie well inside their codes, and the Hessian there says nothing.
     """
-    enough = [
-        entry for entry in precisions[1:] if np.all((entry.values >= FEWEST_VALUES) | (precisions[0].variance == 0))
-    ]
-    return max([precisions[0], *enough], key=lambda entry: entry.information)
+    told = [one for one, own in zip(precisions, _told(precisions), strict=True) if np.all(own)]
+    return max(told, key=lambda entry: entry.information)
 
 
 def _variances(precisions: Sequence[Precision]) -> Float[np.ndarray, "N U"]:
     """Variance of each unknown, infinite where not enough values tell of it."""
     variance = np.array([entry.variance for entry in precisions])
-    enough = np.array([entry.values for entry in precisions]) >= FEWEST_VALUES
+    return np.where(_told(precisions) & (variance > 0), variance, np.inf)
+
+
+def _told(precisions: Sequence[Precision]) -> Bool[np.ndarray, "N U"]:
+    """Of which unknowns enough values tell, and did with more noise too; those that nothing tells of are left out.
+
+    Where few did an estimate may be anywhere between the edges that are left, and many may lie near where it is then.
+    """
+    unknown = precisions[0].variance == 0
     # With the most noise all values tell.
-    enough[0] = True
-    return np.where(enough & (variance > 0), variance, np.inf)
+    found, last = [np.ones(unknown.shape, bool)], precisions[0]
+    for entry in precisions[1:]:
+        enough = (entry.values >= FEWEST_VALUES) | unknown
+        # What was looked at anew starts with more noise again.
+        found.append(enough & found[-1] if entry.noise < last.noise else enough)
+        last = entry
+    return np.array(found)
 
 
 def least_variance(precisions: Sequence[Precision]) -> Float[np.ndarray, " U"]:
@@ -391,14 +402,16 @@ def most_informative_score(
         return score, precision(problem, there, score)
 
     most = most_informative(precisions)
-    score, known = here(next(index for index, entry in enumerate(precisions) if entry is most))
-    # Each unknown is known as well as where enough values still tell of it.
-    again = [known]
-    for unknown, variance in enumerate(_variances(precisions).T):
+    first = next(index for index, entry in enumerate(precisions) if entry is most)
+    score, known = here(first)
+    # Each unknown is known as well as where enough values still tell of it, here as on the way.
+    least, variances = np.where(known.variance > 0, known.variance, np.inf), _variances(precisions)
+    for unknown, variance in enumerate(variances.T):
         for index in np.argsort(variance)[: np.count_nonzero(np.isfinite(variance))].tolist():
-            again.append(here(index)[1])
-            if again[-1].values[unknown] >= FEWEST_VALUES:
+            way = [here(step)[1] for step in range(min(first + 1, index), index + 1)]
+            if min(one.values[unknown] for one in way) >= FEWEST_VALUES:
+                least[unknown] = min(least[unknown], way[-1].variance[unknown] or np.inf)
                 break
-    least = np.maximum(least_variance(again), least_variance(precisions))
+    least = np.maximum(least, np.min(variances, axis=0))
     ratio = np.divide(least, known.variance, out=np.ones_like(least), where=(known.variance > 0) & np.isfinite(least))
     return score, np.sqrt(ratio)

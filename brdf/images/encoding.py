@@ -93,6 +93,12 @@ def largest_step(encoding: Encoding, bits: int) -> float:
     return float(np.max(np.diff(decode_table(encoding, min(bits, 16)))))
 
 
+def rgbe_step(pixels: Float[np.ndarray, "*shape C"]) -> Float[np.ndarray, "*shape 1"]:
+    """The distance of two mantissas of RGBE, of which the brightest channel takes 128 to 255; 0 where all are 0."""
+    largest = np.max(pixels, axis=-1, keepdims=True)
+    return np.where(largest > 0, np.ldexp(np.ones_like(largest), np.frexp(largest)[1] - 8), 0)
+
+
 def find_encoding(
     given: Encoding | None, path: Path, format_name: str, spec: Any, bits: int
 ) -> tuple[Encoding, EncodingSource]:

@@ -31,6 +31,7 @@ from brdf.images.encoding import (
     find_encoding,
     largest_step,
     parse_encoding,
+    rgbe_step,
 )
 from brdf.images.jpeg import Jpeg
 
@@ -394,7 +395,8 @@ def _shown(path, image, part, channels: list[int], start: int, stop: int, encodi
     table = decode_table(encoding, 16).astype(np.float32) if coded else None
     for row, stored in enumerate(pixels, start=first + top - start):  # NumPy makes eight bytes of every code
         shown[row, max(left, 0) :][: len(stored)] = decode(stored, encoding) if table is None else table[stored]
-    return shown
+    # Radiance truncates: a mantissa stands for what lies between it and the next (G. Ward, Graphics Gems II, 1991).
+    return shown + 0.5 * rgbe_step(shown) if image.format_name() == "hdr" else shown
 
 
 def read_image(path: AnyPath, *, encoding: Encoding | None = None) -> Float32[np.ndarray, "height width channels"]:

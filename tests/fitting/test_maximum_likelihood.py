@@ -14,6 +14,7 @@ import brdf
 import fitting
 from benchmarks.truth import COVERAGE, LAMBERT, ball, meshed
 from brdf.images.encoding import Encoding, decode, encode
+from fitting.codes import find_codes
 
 # In standard errors: five of some two hundred numbers would be chance once in ten thousand runs.
 FAR = 5.0
@@ -227,6 +228,71 @@ def test_a_highlight_keeps_its_colour_in_files_whose_codec_is_not_known(kind: st
             assert abs(one.value - true) < 4 * one.error
     if kind == "lossless":
         assert found["k_d"][0].error == fitting.fit(codes, scene, encoding="srgb")["k_d"][0].error
+
+
+def scene_of_many_edges(seed: int) -> tuple[brdf.Scene, type[Any], dict[str, Any]]:
+    """Two balls on a plane, seen near by, under lights of three kinds, the first that shows a highlight."""
+    random = np.random.default_rng(seed)
+    while True:
+        camera = brdf.PerspectiveCamera(
+            position=[random.uniform(-2, 2), random.uniform(0.8, 2.5), random.uniform(2.5, 4)],
+            target=random.uniform(-0.2, 0.2, 3),
+            up=[random.uniform(-0.2, 0.2), 1, 0],
+            fov=random.uniform(35, 60),
+            resolution=(64, 56),
+        )
+        shapes = [
+            brdf.Sphere([-0.4, 0, 0], 0.7),
+            brdf.Sphere([0.8, -0.35, 0.4], 0.45),
+            brdf.Rectangle([0, -0.8, 0], [0, 0, 2.2], [2.2, 0, 0]),
+        ]
+        towards, shining = np.add(random.normal(size=3), [0, 1, 0.5]), random.uniform(0.1, 0.5, 3)
+        near = {"position": random.uniform([-2, 1, 0], [2, 3, 3]), "intensity": random.uniform(1, 3, 3)}
+        spot = {"position": random.uniform([-2, 1, 0], [2, 3, 3]), "intensity": random.uniform(2, 5, 3)}
+        spot |= {"cutoff_angle": float(random.choice([15, 25, 40])), "exponent": float(random.choice([0, 2, 9]))}
+        at = random.uniform(-0.4, 0.4, 3)
+        lights = [
+            brdf.DirectionalLight(towards, intensity=shining),
+            brdf.PointLight(**near, attenuation=(0.2, 0.1, 0.7)),
+            brdf.SpotLight(**spot, direction=at - spot["position"]),
+        ]
+        model = [brdf.BlinnPhong, brdf.Phong][random.integers(2)]
+        ambient, sky = random.random() < 0.5, random.uniform(0.1, 0.3, 3)
+        k_a = random.uniform(0.1, 0.5, 3) if ambient else np.zeros(3)
+        k = {"k_a": k_a, "k_d": random.uniform(0.1, 0.7, 3), "k_s": random.uniform(0.05, 0.5, 3)}
+        n = float(np.exp(random.uniform(1, 5)))
+        scene = brdf.Scene(camera, shapes, lights=lights, ambient=sky if ambient else None)
+        image = np.asarray(brdf.render(model(**k, n=n), scene, precision="float64"))
+        lobe = np.asarray(brdf.basis_images(model, scene, n).specular) * k["k_s"]
+        if np.count_nonzero(lobe.max(axis=-1) > 0.05 * image.max()) > 40:
+            return scene, model, {"image": 0.95 * image / image.max(), "k_s": 0.95 * k["k_s"] / image.max()}
+
+
+@pytest.mark.parametrize(("seed", "encoding"), [(7, "linear"), (100, "linear"), (1371, "srgb")])
+def test_where_few_values_tell_of_a_number_what_lies_near_it_then_does_not(seed: int, encoding: Encoding):
+    """The likelihood is flat between some edges, and was taken to be steep where the estimate lay among others."""
+    scene, model, truth = scene_of_many_edges(seed)
+    picture = np.rint(255 * encode(truth["image"], encoding)).astype(np.uint8)
+    result = fitting.fit(picture, scene, model=model, encoding=encoding)
+    for one, true in zip(result["k_s"], truth["k_s"], strict=True):
+        assert abs(one.value - true) < 4 * one.error
+        assert one.error < 0.01 * true
+
+
+def test_radiance_files_are_known_as_their_library_reads_them_and_as_others_do():
+    """A step lies above what most programs read."""
+    one = np.random.default_rng(0).uniform(0, 1, (16, 16, 3)) * np.array([1.0, 0.3, 0.01])
+    step = 2.0 ** (np.floor(np.log2(one.max(axis=-1, keepdims=True))) - 7)
+    read, all_bounds = np.floor(one / step) * step, []
+    for pixels in (read, read + 0.5 * step):
+        codes = find_codes(pixels.astype(np.float32), None, None, None)
+        assert codes is not None
+        assert codes.levels == "RGBE files"
+        all_bounds.append(codes.bounds(slice(0, 16), np.ones(256, bool), None, 1.0))
+        lower, upper = (end / codes.scale for end in (all_bounds[-1].lower, all_bounds[-1].upper))
+        assert np.all((lower <= one.reshape(-1, 3)) & (one.reshape(-1, 3) <= upper))
+    for name in ("lower", "upper"):
+        np.testing.assert_array_equal(*(getattr(bounds, name) for bounds in all_bounds))
 
 
 @pytest.mark.parametrize("writer", ["hdr", "floor"])

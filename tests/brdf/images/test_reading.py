@@ -26,6 +26,18 @@ def test_alpha_is_apart_and_does_not_darken(tmp_path):
     assert read_picture(tmp_path / "c.png").alpha is None
 
 
+def test_a_mantissa_of_radiance_stands_for_the_middle_of_what_was_truncated(tmp_path):
+    """As its own library reads them. Skies and photographs were half a step too dark."""
+    stored = np.array([[[128, 0, 255, 129], [200, 7, 1, 120]], [[0, 0, 0, 0], [255, 255, 255, 136]]], np.uint8)
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\n"
+    (tmp_path / "a.hdr").write_bytes(head + stored.tobytes())
+    expected = (stored[..., :3] + 0.5) * 2.0 ** (stored[..., 3:].astype(float) - 136)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.hdr"), np.where(stored[..., 3:] > 0, expected, 0))
+    values = random(40, 50, 3)
+    write_image(tmp_path / "b.hdr", values)
+    assert abs(np.mean(read_image(tmp_path / "b.hdr") - values)) < 1e-4  # half a step is 1e-3
+
+
 def test_grey(tmp_path):
     stored = codes(6, 5, 1)
     (tmp_path / "a.png").write_bytes(png(stored, colour_type=0))
