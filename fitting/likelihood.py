@@ -302,11 +302,11 @@ def interval(
 
 
 class _Table(NamedTuple):
-    """Value, score by the distance and weight, (3, knots), over the distance of a prediction beyond the upper end."""
+    """Value, score by the distance, weight and its slope over the distance of a prediction beyond the upper end."""
 
     first: float
     step: float
-    values: Float[np.ndarray, "3 K"]
+    values: Float[np.ndarray, "4 K"]
 
 
 @functools.lru_cache(maxsize=256)
@@ -315,15 +315,15 @@ def _table(ratio: float) -> _Table:
     first = -min(0.5 * ratio, _INSIDE)
     beyond, step = np.linspace(first, _OUTSIDE, _KNOTS, retstep=True)
     found = interval(np.full(_KNOTS, -ratio), np.zeros(_KNOTS), beyond, np.ones(_KNOTS))
-    return _Table(first, float(step), np.stack(found))
+    return _Table(first, float(step), np.stack([*found, np.gradient(found.weight, step)]))
 
 
 class Values:
     """Some pixels of a picture, and what their values say that lay between bounds, of millions of them on the host.
 
     Where the widths are powers of two of each other, as those of integers and of floating point, by tables over the
-    prediction: cubic between knots where the derivative is at hand, which is right to 1e-8; beyond the last knot the
-    first terms of the tail's series, right to 1e-6 of it.
+    prediction: by Taylor's series about the nearest knot, which is right to 1e-8; beyond the last knot the first terms
+    of the tail's series, right to 1e-6 of it.
     """
 
     def __init__(
@@ -365,17 +365,15 @@ class Values:
         # The others are sure.
         some = np.flatnonzero(self._tells & (beyond >= firsts[self._kind]))
         beyond, kind = beyond.ravel()[some], self._kind.ravel()[some]
-        step = steps[kind]
-        position = np.minimum((beyond - firsts[kind]) / step, _KNOTS - 1.000001)
-        index = position.astype(np.intp)
-        share = position - index
-        index += _KNOTS * kind
-        values, scores, weights = np.concatenate(parts, axis=1)
-        weight = weights[index]
-        after = weights[index + 1]
-        score = _hermite(scores[index], scores[index + 1], -weight * step, -after * step, share)
-        value = _hermite(values[index], values[index + 1], scores[index] * step, scores[index + 1] * step, share)
-        weight = weight + share * (after - weight)
+        position = np.minimum((beyond - firsts[kind]) / steps[kind], _KNOTS - 1.0)
+        index = np.rint(position)
+        away = (position - index) * steps[kind]
+        index = index.astype(np.intp) + _KNOTS * kind
+        value, score, weight, bend = (part[index] for part in np.concatenate(parts, axis=1))
+        bend *= away
+        value += away * (score - away * (0.5 * weight + bend / 6))
+        score -= away * (weight + 0.5 * bend)
+        weight += bend
         tail = beyond > _OUTSIDE
         if tail.any():
             x = beyond[tail]
@@ -387,11 +385,6 @@ class Values:
         for part, own in zip(found, (value, score, weight / s**2), strict=True):
             part.ravel()[some] = own
         return found
-
-
-def _hermite(low: Any, high: Any, start: Any, end: Any, share: Any) -> np.ndarray:
-    rise = high - low
-    return low + share * (start + share * (3 * rise - 2 * start - end + share * (start + end - 2 * rise)))
 
 
 def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], *, level: bool = False) -> Float[np.ndarray, "P C"]:
