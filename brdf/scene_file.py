@@ -31,6 +31,8 @@ LIGHTS: dict[str, type[Light]] = {light.type_name: light for light in _LIGHTS}
 _DISTANT = DirectionalLight | ConstantEnvironment | EnvironmentMap
 
 MOST_BYTES = 1 << 22
+# A value of 1 in an HDR file is read as one that was truncated.
+WHITE_OF_HDR = 1 + 2**-8
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
@@ -86,7 +88,8 @@ def _map(file: Path, radiance=1.0, samples=MAP_SAMPLES):
 def _mask(visibility: Path, visibility_layer: Layer | None = None):
     """The first channel of the picture or layer."""
     if visibility_layer is None:
-        return read_image(visibility, encoding="linear")[..., 0]
+        share = read_image(visibility, encoding="linear")[..., 0]
+        return np.where(share <= WHITE_OF_HDR, np.minimum(share, 1), share)
     return _layer(visibility, read_layers(visibility), visibility_layer)[..., 0]
 
 

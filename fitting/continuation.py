@@ -245,7 +245,7 @@ def maximise(
 
     The noise of the start is not much too small. It is known well enough where its step is no larger than the factor
     ``enough``; that of which fewer values than ``least`` tell of a number is not gone below. ``earlier`` is what some
-    of the same values knew, from much noise to that of the start.
+    of the same values knew of about that noise, the last with the least.
     """
     at, precisions, low, high = start, [], -math.inf, math.inf
     while True:
@@ -258,7 +258,7 @@ def maximise(
         largest = math.log(LONG_STEP if fewest > MANY_VALUES else STEP)
         now, derivative = math.log(at.noise), score.by_log_noise
         low, high = (max(low, now), high) if derivative > 0 else (low, min(high, now))
-        # By the last two scores, of which one takes the place of the other; at first by what is known of the noise.
+        # By the last two scores, of which one takes the place of the other; at first by those of before.
         slope, last = -score.noise_information, (precisions if len(precisions) > 1 else earlier)[-2:]
         if len(last) > 1:
             slope = (last[1].by_log_noise - last[0].by_log_noise) / math.log(last[1].noise / last[0].noise)
@@ -340,17 +340,17 @@ def most_informative(precisions: Sequence[Precision]) -> Precision:
 
     With less noise all pixels of a small highlight may lie well inside their codes, and the Hessian there says nothing.
     """
-    told = [one for one, own in zip(precisions, _told(precisions), strict=True) if np.all(own)]
-    return max(told, key=lambda entry: entry.information)
+    enough = [one for one, own in zip(precisions, _enough_values(precisions), strict=True) if np.all(own)]
+    return max(enough, key=lambda entry: entry.information)
 
 
 def _variances(precisions: Sequence[Precision]) -> Float[np.ndarray, "N U"]:
     """Variance of each unknown, infinite where not enough values tell of it."""
     variance = np.array([entry.variance for entry in precisions])
-    return np.where(_told(precisions) & (variance > 0), variance, np.inf)
+    return np.where(_enough_values(precisions) & (variance > 0), variance, np.inf)
 
 
-def _told(precisions: Sequence[Precision]) -> Bool[np.ndarray, "N U"]:
+def _enough_values(precisions: Sequence[Precision]) -> Bool[np.ndarray, "N U"]:
     """Of which unknowns enough values tell, and did with more noise too; those that nothing tells of are left out.
 
     Where few did an estimate may be anywhere between the edges that are left, and many may lie near where it is then.
@@ -408,9 +408,9 @@ def most_informative_score(
     least, variances = np.where(known.variance > 0, known.variance, np.inf), _variances(precisions)
     for unknown, variance in enumerate(variances.T):
         for index in np.argsort(variance)[: np.count_nonzero(np.isfinite(variance))].tolist():
-            way = [here(step)[1] for step in range(min(first + 1, index), index + 1)]
-            if min(one.values[unknown] for one in way) >= FEWEST_VALUES:
-                least[unknown] = min(least[unknown], way[-1].variance[unknown] or np.inf)
+            steps = [here(step)[1] for step in range(min(first + 1, index), index + 1)]
+            if min(one.values[unknown] for one in steps) >= FEWEST_VALUES:
+                least[unknown] = min(least[unknown], steps[-1].variance[unknown] or np.inf)
                 break
     least = np.maximum(least, np.min(variances, axis=0))
     ratio = np.divide(least, known.variance, out=np.ones_like(least), where=(known.variance > 0) & np.isfinite(least))

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.channels import channel_names
@@ -105,6 +105,21 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         result = dataclasses.replace(result, residual=even[0].residual)
     candidates = () if choice is None else choice.candidates
     return dataclasses.replace(result, candidates=candidates, optimum=optimum)
+
+
+def predictions(problem: FitProblem) -> tuple[list[Float[np.ndarray, "H W C"]], list[Bool[np.ndarray, "H W"]]]:
+    """What the model that is asked for, or the simplest adequate one, shows of each picture, and which pixels counted.
+
+    As `fit_pictures`, of noise that is even, without the errors of anything.
+    """
+    with working_precision(problem.precision):
+        seen = observe(problem)
+        fit, *_ = _fitted(_evenly_noisy(seen))
+        shown: list[list[np.ndarray]] = [[] for _ in problem.targets]
+        for picture, owner in zip(fit.pictures, seen.owner, strict=True):
+            shown[owner].append(np.asarray(picture.predict(fit.optimum.n, fit.optimum.x)))
+    both = zip(shown, problem.targets, strict=True)
+    return [np.concatenate(parts).reshape(target.pixels.shape) for parts, target in both], seen.counted
 
 
 def _with_growing_noise(first: _Fitted, seen: Observed) -> _Fitted:

@@ -280,7 +280,7 @@ class _Picture:
         """Those by k_a, k_d, k_s and, but for a factor, n."""
         material, scene = self.moved({}, 0.0)
         found = np.array(basis_columns(material, scene))
-        found[3] *= getattr(material, "k_s", 0.0)
+        found[3] *= np.asarray(getattr(material, "k_s", 0.0))
         return self.curve(self.fitted) * found
 
     def codes(self, values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:

@@ -93,8 +93,7 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Any]) -> tup
     if not callable(by):
         what = f"must be a function, got {by!r}"
         raise brdf.InputError("by", what, "Write lambda scenes: (scenes[0].lights[0].direction,)")
-    if result.loss != "squared":
-        raise brdf.InputError("result", f"must be of the squared loss, got {result.loss}", "Fit without a loss")
+    _check_loss(result)
     unknowns = _unknowns(result)
     count = len(unknowns)
     with working_precision("float64"), waiting("differentiating the fit"):
@@ -104,11 +103,11 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Any]) -> tup
         own = {id(leaf): index for index, leaf in enumerate(jax.tree.leaves(content[1]))}
         leaves = chosen_leaves("by", by, {"scenes": content[1]}, "(scenes[0].lights[0].direction,)")
         curvature = partial(_curvature, content, unknowns, pictures, places=tuple(own[id(leaf)] for leaf in leaves))
-        vector = jnp.concatenate([jnp.zeros(count), *map(jnp.ravel, leaves)])
+        vector = np.concatenate([np.zeros(count), *(np.ravel(np.asarray(leaf)) for leaf in leaves)])
         slope, rows = map(np.asarray, curvature(vector))
         # A fit in float32 stops a little beside the stationary point; Newton's steps go there.
         for _ in range(NEWTON_STEPS):
-            vector = vector.at[:count].add(-_inverse(rows[:, :count]) @ slope)
+            vector[:count] -= _inverse(rows[:, :count]) @ slope
             slope, rows = map(np.asarray, curvature(vector))
     moves = np.zeros((3 * result.material.k_d.size + 1, rows.shape[1] - count))
     moves[: unknowns.shape[1]] = -unknowns.T @ _inverse(rows[:, :count]) @ rows[:, count:]
@@ -146,13 +145,18 @@ def _curvature(
     return slope[:count], jax.lax.map(along, jnp.eye(count, vector.size))
 
 
+def _check_loss(result: FitResult) -> None:
+    if result.loss != "squared":
+        raise brdf.InputError("result", f"must be of the squared loss, got {result.loss}", "Fit without a loss")
+
+
 def _unknowns(result: FitResult) -> Float[np.ndarray, "U S"]:
     """What each unknown moves of the material's numbers.
 
     A grey highlight is one number, and the only way for all channels to agree to the last digit.
     """
     material, rows = result.material, {}
-    size, k_s = ravel_pytree(material)[0].size, np.asarray(getattr(material, "k_s", np.zeros(1)))
+    size, k_s = sum(map(np.size, jax.tree.leaves(material))), np.asarray(getattr(material, "k_s", np.zeros(1)))
     for one in result.free_parameters:
         grey = one.name == "k_s" and np.all(k_s == k_s[0])
         row = rows.setdefault(one.name if grey else one.key, np.zeros(size))
@@ -174,8 +178,11 @@ def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
 
     Of pictures under one distant light each, whose direction has a standard error in degrees, the root mean square of
     the angle. What the turns of a light change of its picture the numbers follow by least squares, as far as some
-    pixels tell; refused where these do not determine the numbers.
+    pixels tell; refused where these do not determine the numbers, or the loss is another.
     """
+    _check_loss(result)
+    if not result.free_parameters:
+        return result
     own, channels = _unknowns(result), result.material.k_d.size
     unknowns = np.zeros((len(own), 3 * channels + 1))  # Lambert's law has no highlight
     unknowns[:, : own.shape[1]] = own
@@ -184,12 +191,13 @@ def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
     gram, products = np.zeros((channels, 4, 4)), []
     with working_precision("float64"), waiting("differentiating the fit"):
         material = brdf.cast(result.material, "float64")
-        for index, error in enumerate(degrees):
-            pixel, weight = np.flatnonzero(result.counted[index]), result.weighed[index]
+        for whole, weights, error in zip(result.scenes, result.weighed, degrees, strict=True):
+            weight = weights.reshape(math.prod(whole.resolution), -1)
+            pixel = np.flatnonzero(np.any(weight > 0, axis=1))
             some = pixel[np.linspace(0, pixel.size - 1, min(pixel.size, MOST_PIXELS)).astype(int)]
-            scene = brdf.some_pixels(result.scenes[index], some, precision="float64")
+            scene = brdf.some_pixels(whole, some, precision="float64")
             shown = _columns(material, scene, np.zeros(3))
-            weighted = shown * weight.reshape(result.counted[index].size, -1)[some] * (pixel.size / some.size)
+            weighted = shown * weight[some] * (pixel.size / some.size)
             gram += np.einsum("ipc,jpc->cij", weighted, shown)
             direction = np.asarray(scene.lights[0].direction, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
             # Two small turns of it share the angle; it does not matter how long it is.

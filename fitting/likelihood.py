@@ -322,8 +322,8 @@ class Values:
     """Some pixels of a picture, and what their values say that lay between bounds, of millions of them on the host.
 
     Where the widths are powers of two of each other, as those of integers and of floating point, by tables over the
-    prediction: by Taylor's series about the nearest knot, which is right to 1e-8; beyond the last knot the first terms
-    of the tail's series, right to 1e-6 of it.
+    prediction: by Taylor's series about the nearest knot, value and score right to 1e-8, the weight to 3e-6; beyond the
+    last knot the first terms of the tail's series, right to 1e-6 of it.
     """
 
     def __init__(
@@ -369,11 +369,11 @@ class Values:
         index = np.rint(position)
         away = (position - index) * steps[kind]
         index = index.astype(np.intp) + _KNOTS * kind
-        value, score, weight, bend = (part[index] for part in np.concatenate(parts, axis=1))
-        bend *= away
-        value += away * (score - away * (0.5 * weight + bend / 6))
-        score -= away * (weight + 0.5 * bend)
-        weight += bend
+        value, score, weight, change = (part[index] for part in np.concatenate(parts, axis=1))
+        change *= away
+        value += away * (score - away * (0.5 * weight + change / 6))
+        score -= away * (weight + 0.5 * change)
+        weight += change
         tail = beyond > _OUTSIDE
         if tail.any():
             x = beyond[tail]

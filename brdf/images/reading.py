@@ -392,11 +392,13 @@ def _shown(path, image, part, channels: list[int], start: int, stop: int, encodi
     ]
     if channels != list(range(low, high)):
         pixels = pixels[..., [channel - low for channel in channels]]
+    if image.format_name() == "hdr":
+        # Radiance truncates: a mantissa stands for what lies between it and the next (G. Ward, Graphics Gems II, 1991).
+        pixels = pixels + 0.5 * rgbe_step(pixels)
     table = decode_table(encoding, 16).astype(np.float32) if coded else None
     for row, stored in enumerate(pixels, start=first + top - start):  # NumPy makes eight bytes of every code
         shown[row, max(left, 0) :][: len(stored)] = decode(stored, encoding) if table is None else table[stored]
-    # Radiance truncates: a mantissa stands for what lies between it and the next (G. Ward, Graphics Gems II, 1991).
-    return shown + 0.5 * rgbe_step(shown) if image.format_name() == "hdr" else shown
+    return shown
 
 
 def read_image(path: AnyPath, *, encoding: Encoding | None = None) -> Float32[np.ndarray, "height width channels"]:

@@ -32,7 +32,7 @@ def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how
     """Read and fit, where a file does not say how it is encoded under that of two interpretations which explains it.
 
     ``read`` gives the inputs, also with other encodings by file, ``say`` tells what is being done, and ``how`` are
-    further arguments of `fitting.fit`; seconds are shared by the trials and the fit.
+    further arguments of `fitting.fit`. Its seconds are those of the fit after the trial.
 
     Returns:
         The fit to keep, with a warning where the encoding is a guess or was changed; and what was fitted.
@@ -44,22 +44,19 @@ def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how
         say(what)
         return _fit(inputs, how), inputs
     path, assumed = next(iter(inputs.silent.items()))
-    if how["seconds"] is not None and how["seconds"] > 0:  # or the fit says what is wrong with it
-        how["seconds"] /= 3
-    # What rounding did to either is of no account beside a wrong curve.
-    plainly = how | {"rounding": 0}
     say(f"trying {NAMES[assumed]} and {NAMES[OTHER[assumed]]}")
-    warning, trial = "", _fit(inputs, plainly)
+    asked = {name: how[name] for name in ("model", "precision", "saturation", "dark", "noise", "plausible", "loss")}
+    warning, trial = "", _predicted(inputs, asked)
     try:
         others = read({path: OTHER[encoding] for path, encoding in inputs.silent.items()})
-        other = _fit(others, plainly)
+        other = _predicted(others, asked)
     except InputError:
         pass  # under the other encoding it cannot be fitted at all
     else:
         # To be compared where both count: each leaves out what under its own encoding is cut off.
-        both = [mine & its for mine, its in zip(trial.counted, other.counted, strict=True)]
+        both = [mine & its for mine, its in zip(trial[1], other[1], strict=True)]
         both = both if all(counted.any() for counted in both) else None
-        shares = [_unexplained(fit, its, both or fit.counted) for fit, its in ((trial, inputs), (other, others))]
+        shares = [_unexplained(fitted, its, both or own) for (fitted, own), its in ((trial, inputs), (other, others))]
         is_other, warning = judge(assumed, *shares)
         inputs = others if is_other else inputs
     say(what)
@@ -68,19 +65,26 @@ def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how
     return dataclasses.replace(result, warnings=(*result.warnings, *warnings)), inputs
 
 
+def _predicted(inputs, asked):
+    from fitting.core import predictions
+    from fitting.problem import state_problem
+
+    with named_as({"target": inputs.targets[0]}):
+        return predictions(state_problem(inputs.pictures, inputs.scenes, inputs.masks, **asked))
+
+
 def _fit(inputs, how):
     with named_as({"target": inputs.targets[0]}):
         return fitting.fit(inputs.pictures, inputs.scenes, mask=inputs.masks, **how)
 
 
-def _unexplained(result, inputs, counted):
+def _unexplained(fitted, inputs, counted):
     """What a fit leaves of the codes in the files: the share of their squares."""
     left = total = 0.0
-    for index, (picture, some) in enumerate(zip(inputs.pictures, counted, strict=True)):
-        fitted = np.broadcast_to(result.fitted(index), picture.pixels.shape)
+    for shown, picture, some in zip(fitted, inputs.pictures, counted, strict=True):
         codes, model = (
             encode(np.ascontiguousarray((values / picture.factor)[some], np.float32), picture.encoding)
-            for values in (picture.pixels, fitted)
+            for values in (picture.pixels, shown)
         )
         codes = codes.astype(np.float64)
         left += np.sum((codes - model) ** 2) + codes.size * (picture.code_step or 0) ** 2 / 12

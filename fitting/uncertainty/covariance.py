@@ -385,7 +385,8 @@ def _without_bound(
         return 0.0, math.inf, math.inf, np.zeros(size)
     score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ optimum.x[:, channel]
     value, (deviation, alone) = float(score / left), (np.sqrt(direction @ inner.middles @ direction) / left).tolist()
-    return value, deviation, alone, (direction - own) * above_zero(value, deviation)[1] / NORMAL_95
+    moved, farthest = direction - own, above_zero(value, deviation)[1] / NORMAL_95
+    return value, deviation, alone, np.multiply(moved, farthest, out=np.zeros(size), where=moved != 0)
 
 
 def _inverted(

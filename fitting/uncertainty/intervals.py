@@ -96,6 +96,8 @@ def exponent_interval(
     logarithm of the lobe's cosine in the pixel nearest to its centre.
     """
     optimum = fit.optimum
+    if not math.isfinite(delta_cost):  # what is left tells no noise
+        return (0.0, math.inf), optimum.x[None]
     relative = n_error / optimum.n
     bounds = math.log(fit.n_range[0]), math.log(fit.n_range[1])
     centre = math.log(optimum.n)

@@ -208,7 +208,7 @@ def scatter(
         slopes = picture.columns(optimum.n)[:, counts] * np.sqrt(weights[counts])
         slopes[3] *= optimum.x[2]
         terms = slopes * own.values
-        by_x = np.moveaxis(terms[:3], -1, 1).reshape(-1, terms.shape[1])
+        by_x = np.concatenate(np.moveaxis(terms[:3], -1, 1))
         scores = np.concatenate([by_x, terms[3].sum(axis=1)[None]])
         fitted = None if covariance is None else (slopes, covariance, places_of(slopes.shape[2]))
         total = total + block_scatter(scores, own, fitted)

@@ -59,6 +59,18 @@ def test_a_clipped_highlight_is_left_out_by_what_is_predicted(tmp_path: Path):
     assert abs(np.mean(off)) < 1.0
 
 
+def test_a_band_of_which_no_pixel_counts_tells_of_nothing_that_errs_together(tmp_path: Path):
+    clean = np.asarray(brdf.render(MATERIAL, scene()))
+    coarse = np.random.default_rng(0).standard_normal((-(-clean.shape[0] // 4), -(-clean.shape[1] // 4), 1))
+    noise = 0.03 * np.kron(coarse, np.ones((4, 4, 1)))[: clean.shape[0], : clean.shape[1]]
+    brdf.write_image(tmp_path / "blocks.exr", (clean + noise).astype(np.float32))
+    below = np.arange(clean.shape[0])[:, None] * np.ones(clean.shape[1]) > clean.shape[0] / 2
+    with brdf.ImageReader(tmp_path / "blocks.exr") as reader:
+        result = fitting.fit(reader, scene(), model="blinn-phong", mask=below)
+    assert any("structure" in words for words in result.warnings)
+    assert abs(result["k_d"][0].value - MATERIAL.k_d[0]) < 4 * result["k_d"][0].error
+
+
 def test_a_clipped_picture_in_tiles_is_fitted_as_a_whole_one(monkeypatch):
     clean = np.asarray(brdf.render(MATERIAL, scene()))
     noise = 0.02 * np.random.default_rng(5).standard_normal(clean.shape)

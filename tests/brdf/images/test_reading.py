@@ -33,6 +33,8 @@ def test_a_mantissa_of_radiance_stands_for_the_middle_of_what_was_truncated(tmp_
     (tmp_path / "a.hdr").write_bytes(head + stored.tobytes())
     expected = (stored[..., :3] + 0.5) * 2.0 ** (stored[..., 3:].astype(float) - 136)
     np.testing.assert_array_equal(read_image(tmp_path / "a.hdr"), np.where(stored[..., 3:] > 0, expected, 0))
+    encoded = read_image(tmp_path / "a.hdr", encoding=2.2)
+    np.testing.assert_allclose(encoded, np.where(stored[..., 3:] > 0, expected, 0) ** 2.2, rtol=1e-5)
     values = random(40, 50, 3)
     write_image(tmp_path / "b.hdr", values)
     assert abs(np.mean(read_image(tmp_path / "b.hdr") - values)) < 1e-4  # half a step is 1e-3

@@ -103,6 +103,16 @@ def test_a_scene_that_casts_no_shadow_has_no_shadow_rays():
     assert operations(ball) < 0.6 * operations(scene(light))
 
 
+def test_a_white_mask_may_be_an_hdr_file(tmp_path: Path):
+    """Its ones are read as what was truncated to them."""
+    brdf.write_image(tmp_path / "white.hdr", np.ones((48, 48, 3)))
+    scene(brdf.DirectionalLight(direction=[0, 0, 1], intensity=1)).save(tmp_path / "scene.toml")
+    words = (tmp_path / "scene.toml").read_text() + 'visibility = "white.hdr"\n'
+    (tmp_path / "scene.toml").write_text(words)
+    (mask,) = brdf.Scene.load(tmp_path / "scene.toml").visibility
+    np.testing.assert_array_equal(mask, 1)
+
+
 def test_a_given_mask_stands_in_for_geometry(tmp_path: Path):
     lights = [brdf.DirectionalLight(direction=[0, 0, 1], intensity=1), brdf.PointLight(position=[1, 1, 3], intensity=4)]
     shapes = [brdf.Sphere(center=[0, 0, 0], radius=0.8)]

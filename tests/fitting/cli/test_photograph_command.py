@@ -112,6 +112,22 @@ def test_a_file_that_does_not_say_its_encoding_is_read_as_the_model_explains_it(
     assert not any("encoded" in warning for warning in json.loads(out)["warnings"])
 
 
+@pytest.mark.parametrize("brightest", [2.0, 8.0])
+def test_the_encoding_of_a_clipped_photograph_is_told_by_the_channels_that_are_not(
+    tmp_path, capsys, monkeypatch, brightest
+):
+    """Where red is clipped the others show the curve; of whole pixels alone both explained what was left."""
+    monkeypatch.chdir(tmp_path)
+    colour = brightest * np.array([1.0, 0.4, 0.1])
+    write_silent("ball.png", np.minimum(shaded((0.3, 0.4, 0.86)) * colour, 1), "linear", "uint8")
+    words = ["--sphere", f"{BALL.x},{BALL.y},{BALL.radius}", "--light", "0.3,0.4,0.86", "--model", "lambert"]
+    status, out, err = run(capsys, "fit", "ball.png", *words)
+    assert status == 0, err
+    assert "read as linear" in out
+    left, other = map(float, re.search(r"off by ([\d.]+) % .* sRGB by ([\d.]+) %", out).groups())  # pyright: ignore
+    assert left < 0.15 * other
+
+
 @pytest.mark.parametrize("whole", [False, True])
 def test_transparent_pixels_show_nothing_unless_all_are(tmp_path, capsys, monkeypatch, whole):
     monkeypatch.chdir(tmp_path)
