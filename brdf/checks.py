@@ -104,14 +104,14 @@ def _numbers(name, value, words, largest=LARGEST):
     if isinstance(value, jax.Array):
         return value
     array = as_numbers(name, value, words)
-    _refuse(name, array, {"finite": np.isfinite, f"within ± {largest:g}": lambda values: ~(np.abs(values) > largest)})
+    _refuse(name, array, {"finite": np.isfinite(array), f"within ± {largest:g}": ~(np.abs(array) > largest)})
     return array
 
 
 def _refuse(name, array, limits, place=""):
-    """Refuse known numbers of which one is not good, by the words for what tells; those of JAX are not looked at."""
-    for words, holds in limits.items() if isinstance(array, np.ndarray) else ():
-        if not np.all(good := holds(array)):
+    """Refuse known numbers of which one is not good, by the words for that."""
+    for words, good in limits.items():
+        if isinstance(array, np.ndarray) and not np.all(good):
             first = int(np.argmin(good))
             where = place.format(first) if array.size > 1 else ""
             raise InputError(name, f"must be {words}, got {array.flat[first]:g}{where}", "Correct the value")
@@ -157,9 +157,8 @@ def number(
     array = _numbers(name, value, "a number")
     if array.shape != () or isinstance(value, bool):
         raise InputError(name, f"must be one number, got {what_came(value)}", "Give a single number")
-    limits = {f"at least {low:g}": lambda one: one >= low, f"at most {high:g}": lambda one: one <= high}
-    limits |= {f"greater than {above:g}": lambda one: one > above, f"less than {below:g}": lambda one: one < below}
-    _refuse(name, array, limits)
+    limits = {f"at least {low:g}": array >= low, f"at most {high:g}": array <= high}
+    _refuse(name, array, limits | {f"greater than {above:g}": array > above, f"less than {below:g}": array < below})
     return array
 
 
@@ -172,7 +171,7 @@ def spectrum(name: str, value: Any, largest: float = LARGEST) -> Any:
     """One value per channel, from 0 to ``largest``; a single number becomes one channel."""
     words, remedy = "a number per channel", "Give a list of numbers"
     array = _shaped(name, value, lambda count=1, *more: count > 0 and not more, words, remedy, largest)
-    _refuse(name, array, {"at least 0": lambda values: values >= 0}, " in channel {}")
+    _refuse(name, array, {"at least 0": array >= 0}, " in channel {}")
     return array.reshape(-1)
 
 
