@@ -118,8 +118,8 @@ def predictions(problem: FitProblem) -> tuple[list[Float[np.ndarray, "H W C"]], 
         shown: list[list[np.ndarray]] = [[] for _ in problem.targets]
         for picture, owner in zip(fit.pictures, seen.owner, strict=True):
             shown[owner].append(np.asarray(picture.predict(fit.optimum.n, fit.optimum.x)))
-    both = zip(shown, problem.targets, strict=True)
-    return [np.concatenate(parts).reshape(target.pixels.shape) for parts, target in both], seen.counted
+    shapes = [target.pixels.shape for target in problem.targets]
+    return [np.concatenate(tiles).reshape(shape) for tiles, shape in zip(shown, shapes, strict=True)], seen.counted
 
 
 def _with_growing_noise(first: _Fitted, seen: Observed) -> _Fitted:

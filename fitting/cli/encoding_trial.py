@@ -7,10 +7,11 @@ leaves is compared in the codes of the file, the same numbers under both, with t
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+import brdf
 import fitting
 from brdf.errors import InputError
 from brdf.images.encoding import encode
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 LESS = 0.9
 # ... and one of them is no guess where it leaves less than this share of what the other leaves.
 CLEARLY = 0.5
+# Pixels on a side that are tried.
+SIDE = 512
 OTHER: dict[Any, str] = {"linear": "srgb", "srgb": "linear"}
 NAMES: dict[Any, str] = {"linear": "linear", "srgb": "sRGB"}
 
@@ -46,18 +49,17 @@ def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how
     path, assumed = next(iter(inputs.silent.items()))
     say(f"trying {NAMES[assumed]} and {NAMES[OTHER[assumed]]}")
     asked = {name: how[name] for name in ("model", "precision", "saturation", "dark", "noise", "plausible", "loss")}
-    warning, trial = "", _predicted(inputs, asked)
+    warning, trial = "", _tried(inputs, asked)
     try:
         others = read({path: OTHER[encoding] for path, encoding in inputs.silent.items()})
-        other = _predicted(others, asked)
+        other = _tried(others, asked)
     except InputError:
         pass  # under the other encoding it cannot be fitted at all
     else:
         # To be compared where both count: each leaves out what under its own encoding is cut off.
-        both = [mine & its for mine, its in zip(trial[1], other[1], strict=True)]
+        both = list(map(np.logical_and, trial.counted, other.counted))
         both = both if all(counted.any() for counted in both) else None
-        shares = [_unexplained(fitted, its, both or own) for (fitted, own), its in ((trial, inputs), (other, others))]
-        is_other, warning = judge(assumed, *shares)
+        is_other, warning = judge(assumed, *(_unexplained(one, both or one.counted) for one in (trial, other)))
         inputs = others if is_other else inputs
     say(what)
     result = _fit(inputs, how)
@@ -65,12 +67,34 @@ def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how
     return dataclasses.replace(result, warnings=(*result.warnings, *warnings)), inputs
 
 
-def _predicted(inputs, asked):
+class _Trial(NamedTuple):
+    """Pictures, what a fit shows of them, and which pixels counted."""
+
+    pictures: list[brdf.Picture]
+    fitted: list[np.ndarray]
+    counted: list[np.ndarray]
+
+
+def _tried(inputs, asked):
     from fitting.core import predictions
     from fitting.problem import state_problem
 
+    pictures, scenes, masks = map(list, zip(*map(_thinned, inputs.pictures, inputs.scenes, inputs.masks), strict=True))
     with named_as({"target": inputs.targets[0]}):
-        return predictions(state_problem(inputs.pictures, inputs.scenes, inputs.masks, **asked))
+        return _Trial(pictures, *predictions(state_problem(pictures, scenes, masks, **asked)))
+
+
+def _thinned(picture, scene, mask):
+    """Of a large picture every so many rows and columns, which tell a curve as well."""
+    height, width = picture.pixels.shape[:2]
+    stride = -(-max(height, width) // SIDE)
+    if stride == 1:
+        return picture, scene, mask
+    some = (slice(None, None, stride),) * 2
+    alpha, mask = (None if one is None else one[some] for one in (picture.alpha, mask))
+    # Pixels of a block of a JPEG are known by their neighbours.
+    picture = dataclasses.replace(picture, pixels=picture.pixels[some], alpha=alpha, jpeg=None)
+    return picture, brdf.some_pixels(scene, np.arange(height * width).reshape(height, width)[some]), mask
 
 
 def _fit(inputs, how):
@@ -78,10 +102,10 @@ def _fit(inputs, how):
         return fitting.fit(inputs.pictures, inputs.scenes, mask=inputs.masks, **how)
 
 
-def _unexplained(fitted, inputs, counted):
+def _unexplained(trial, counted):
     """What a fit leaves of the codes in the files: the share of their squares."""
     left = total = 0.0
-    for shown, picture, some in zip(fitted, inputs.pictures, counted, strict=True):
+    for picture, shown, some in zip(trial.pictures, trial.fitted, counted, strict=True):
         codes, model = (
             encode(np.ascontiguousarray((values / picture.factor)[some], np.float32), picture.encoding)
             for values in (picture.pixels, shown)

@@ -16,6 +16,7 @@ from command_runs import run
 import brdf
 from brdf.images.encoding import encode
 from fitting.cli import encoding_trial
+from fitting.core import predictions
 from fitting.photographs.ball import Circle, ball_points, ball_seen
 from fitting.photographs.light_files import read_directions
 
@@ -110,6 +111,27 @@ def test_a_file_that_does_not_say_its_encoding_is_read_as_the_model_explains_it(
     _, out, _ = run(capsys, *words, "--encoding", wrong, "--model", "lambert", "--json")
     assert k_d(out) != pytest.approx(0.8, rel=0.05)
     assert not any("encoded" in warning for warning in json.loads(out)["warnings"])
+
+
+def test_of_a_large_picture_some_pixels_tell_its_encoding(tmp_path, capsys, monkeypatch):
+    """The trial knows nothing of --seconds: of all pixels of a large one it took longer than these."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(encoding_trial, "SIDE", 40)
+    tried = []
+
+    def remembered(problem):
+        tried.append([target.pixels.shape for target in problem.targets])
+        return predictions(problem)
+
+    monkeypatch.setattr("fitting.core.predictions", remembered)
+    write_silent("ball.png", shaded((0.3, 0.4, 0.86)), "linear", "uint8")
+    brdf.write_image("mask.png", np.ones(SHAPE))
+    words = ["--sphere", f"{BALL.x},{BALL.y},{BALL.radius}", "--light", "0.3,0.4,0.86", "--mask", "mask.png"]
+    status, out, err = run(capsys, "fit", "ball.png", *words, "--model", "lambert")
+    assert status == 0, err
+    assert "read as linear" in out
+    assert len(tried) == 2
+    assert max(max(shape) for shapes in tried for shape in shapes) <= 40
 
 
 @pytest.mark.parametrize("brightest", [2.0, 8.0])
