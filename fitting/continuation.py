@@ -258,7 +258,7 @@ def maximise(
         largest = math.log(LONG_STEP if fewest > MANY_VALUES else STEP)
         now, derivative = math.log(at.noise), score.by_log_noise
         low, high = (max(low, now), high) if derivative > 0 else (low, min(high, now))
-        # By the last two scores, of which one takes the place of the other; at first by those of before.
+        # By the last two scores, of which one takes the place of the other; at first by earlier ones, if there are any.
         slope, last = -score.noise_information, (precisions if len(precisions) > 1 else earlier)[-2:]
         if len(last) > 1:
             slope = (last[1].by_log_noise - last[0].by_log_noise) / math.log(last[1].noise / last[0].noise)

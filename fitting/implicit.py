@@ -199,7 +199,8 @@ def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
             shown = _columns(material, scene, np.zeros(3))
             weighted = shown * weight[some] * (pixel.size / some.size)
             gram += np.einsum("ipc,jpc->cij", weighted, shown)
-            direction = np.asarray(scene.lights[0].direction, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
+            light: Any = scene.lights[0]
+            direction = np.asarray(light.direction, np.float64)
             # Two small turns of it share the angle; it does not matter how long it is.
             length = np.linalg.norm(direction) * math.radians(error) / math.sqrt(2)
             for turn in np.linalg.svd(direction[None])[2][1:] * length:

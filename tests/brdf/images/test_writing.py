@@ -116,9 +116,10 @@ def test_hdr_has_no_sign(tmp_path):
     """It held 3 for -1, and 0 0 0 where a value was beyond the format's."""
     path = tmp_path / "a.hdr"
     write_image(path, [[[-1.0, 2.0, 0.5], [np.nan, 0.25, 1e38]]])
-    # What is as dark as a channel that has no light, beside the brightest.
-    none, nothing = 2**-7, 2.0**118
-    np.testing.assert_allclose(read_image(path), [[[none, 2, 0.5], [nothing, nothing, 1e38]]], rtol=2**-6)
+    # Half a step above what was written, of the channels' shared exponent.
+    half, other = 2**-7, 2.0**118
+    expected = [[[half, 2 + half, 0.5 + half], [other, other, 1e38]]]
+    np.testing.assert_allclose(read_image(path), expected, rtol=2**-8)
     for beyond in (2e38, np.inf):
         with pytest.raises(InputError, match="values in HDR end at"):
             write_image(path, [[[beyond]]])
