@@ -17,14 +17,13 @@ from brdf.channels import channel_names
 from brdf.errors import InputError
 from brdf.lobes import Near
 from brdf.precision import working_precision
-from brdf.rendering import basis
 from fitting.doubts import doubts
 from fitting.growing_noise import Shown, as_it_grows, likeliest
 from fitting.jpeg_errors import codec_of, without_codec_errors
 from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import bounds_of, highlight_in_codes, most_likely, unexplained
 from fitting.model_fit import ModelFit
-from fitting.pixels import Observed, Tile, observe
+from fitting.pixels import Observed, observe, picture_of
 from fitting.problem import FitProblem
 from fitting.result import FitResult
 from fitting.sample_error import MOST, between, near_exponent, nearer
@@ -183,18 +182,6 @@ def _fitted(observed: Observed) -> _Fitted:
     del fits, by_squares  # what is known of the others fills memory
     chosen = _as_chosen(fit, choice, tied)
     return *_less_codec_errors(chosen, choice, observed), statistics if chosen is fit else None
-
-
-def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
-    """A tile as the solver takes it; ``near`` is that of `brdf.rendering.basis`."""
-    ambient = np.zeros(1) if tile.scene.ambient is None else np.asarray(tile.scene.ambient, np.float64)
-    # What a file's largest code stands for has no weight, but a say.
-    counts = None if tile.weight is None or tile.bounds is not None else np.asarray(tile.weight) > 0
-    images = basis(model, tile.scene, points=tile.points, near=near, counts=counts)
-    diffuse = images.diffuse
-    if diffuse is None:
-        diffuse = jnp.zeros((tile.target.shape[0], 1), tile.target.dtype)
-    return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient, tile.bounds)
 
 
 def _fit_model(

@@ -30,11 +30,11 @@ from brdf.precision import working_precision
 from brdf.rendering import basis_columns
 from brdf.vectors import quotient
 from fitting.budget.sampling import sample_counts, with_samples
-from fitting.core import fit_pictures, picture_of
+from fitting.core import fit_pictures
 from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
 from fitting.likelihood import how_many_alike, weight_of_alike
 from fitting.model_fit import N_RANGE
-from fitting.pixels import Tile
+from fitting.pixels import Tile, picture_of
 from fitting.problem import state_problem
 from fitting.result import Cause, FitResult
 from fitting.solver.normal_equations import Picture

@@ -20,14 +20,16 @@ from jaxtyping import Array, Bool, Float
 import brdf
 from brdf.errors import InputError
 from brdf.geometry.rays import Sight
+from brdf.lobes import STORED_SAMPLES, Near
 from brdf.models.base import SpecularMaterial
-from brdf.precision import Precision, at_a_time
+from brdf.precision import Precision, at_a_time, cast, working_precision
+from brdf.rendering import basis
 from fitting.codes import Rounding, open_ends
-from fitting.light_colour import take_colour_out
+from fitting.light_colour import coefficient_factors, take_colour_out
 from fitting.likelihood import Bounds, over_channels
 from fitting.problem import TOP, FitProblem, Target, as_target, has_pixel_areas
 from fitting.solver.devices import device_count
-from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, totals
+from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, Picture, totals
 from fitting.solver.streams import Stream, each, joined
 
 # How many pixels are taken together; of a file at least as many rows as its blocks hold, or these are read twice.
@@ -65,6 +67,33 @@ class Tile(NamedTuple):
     points: Sight
     scene: brdf.Scene
     bounds: Bounds | None = None
+
+
+def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
+    """A tile as the solver takes it; ``near`` is that of `brdf.rendering.basis`."""
+    ambient = np.zeros(1) if tile.scene.ambient is None else np.asarray(tile.scene.ambient, np.float64)
+    # What a file's largest code stands for has no weight, but a say.
+    counts = None if tile.weight is None or tile.bounds is not None else np.asarray(tile.weight) > 0
+    images = basis(model, tile.scene, points=tile.points, near=near, counts=counts)
+    diffuse = images.diffuse
+    if diffuse is None:
+        diffuse = jnp.zeros((tile.target.shape[0], 1), tile.target.dtype)
+    return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient, tile.bounds)
+
+
+def shown(material: brdf.Material, scene: brdf.Scene, precision: Precision) -> Float[np.ndarray, "H W C"]:
+    """What `brdf.render` makes of a fitted material; of a small picture by the program that the fit has loaded."""
+    (width, height), channels = scene.resolution, max(scene.channels, material.k_d.size)
+    with working_precision(precision):
+        colour, (grey,) = take_colour_out([cast(scene, precision)], channels)
+        points, samples = grey.sight(), sum(len(light.rows[1][0]) for light in grey.lights)
+        if points.area is not None or samples > STORED_SAMPLES or width * height * channels > FEW_VALUES:
+            return np.asarray(brdf.render(material, scene, precision=precision))
+        nothing = jax.device_put(np.zeros((width * height, channels), precision))
+        picture, n = picture_of(type(material), Tile(nothing, None, points, grey)), float(getattr(material, "n", 1.0))
+        k = np.stack([np.broadcast_to(getattr(material, name, 0.0), channels) for name in ("k_a", "k_d", "k_s")])
+        values = picture.predict(n, k * coefficient_factors(type(material), n, colour))
+        return np.where(np.ravel(points.mask)[:, None], values, 0).reshape(height, width, channels)
 
 
 class Observed(NamedTuple):

@@ -56,6 +56,8 @@ def main(arguments: list[str] | None = None) -> Any:
             stream.reconfigure(errors="replace")  # ± on a terminal that knows ASCII alone
     # What importing and tracing make mostly stays: looking for garbage among it takes a tenth of the time.
     gc.set_threshold(100_000, 20, 20)
+    # Products in NumPy are of few rows: cores that share one wait for each other longer than one takes for it.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _keep_compiled_programs()
     command, words = typer.main.get_command(app), sys.argv[1:] if arguments is None else arguments
     try:

@@ -249,9 +249,10 @@ def _left_out(
     held = np.sum(apart * (own @ apart), axis=(0, 1))
     root = np.linalg.svd(covariance, hermitian=True)
     root = root.U * np.sqrt(root.S)
-    found = together.copy()
+    found, order = together.copy(), np.argsort(blocks, kind="stable")
+    ends = np.cumsum(np.bincount(blocks))
     for block in np.flatnonzero(np.bincount(blocks, weights=held) > LEAST_HELD):
-        hessian, some = np.zeros_like(covariance), slopes[:, blocks == block]
+        hessian, some = np.zeros_like(covariance), slopes[:, order[ends[block - 1] if block else 0 : ends[block]]]
         for c, place in enumerate(index):
             hessian[np.ix_(place, place)] += some[..., c] @ some[..., c].T
         values, vectors = np.linalg.eigh(root.T @ hessian @ root)
