@@ -205,6 +205,7 @@ def fit_basis(
     weight: Array,
     ambient: Array | None,
     n_range: tuple[float, float],
+    alike: bool = False,
 ) -> Solution:
     """What `fit` does once the basis images of a scene are known: of a target (..., C) of P pixels and weights (P,)."""
     scale = model.scale if issubclass(model, SpecularMaterial) else None
@@ -215,7 +216,8 @@ def fit_basis(
         lobe = eqx.Partial(lambda lobe, n: lobe(n)[0], lobe)
     ambient = jnp.zeros(1) if ambient is None else ambient
     target = target.reshape(weight.size, -1)
-    return solve(target, diffuse, lobe, ambient=ambient, weight=weight, n_range=n_range, peak=peak, scale=scale)
+    known: dict[str, Any] = {"ambient": ambient, "weight": weight, "n_range": n_range, "peak": peak}
+    return solve(target, diffuse, lobe, **known, scale=scale, alike=alike)
 
 
 @eqx.filter_jit
@@ -229,6 +231,7 @@ def solve(
     n_range: tuple[float, float] = (0.1, 1e6),
     peak: Float[ArrayLike, ""] = 0.0,
     scale: Callable[..., Any] | None = None,
+    alike: bool = False,
 ) -> Solution:
     """The optimum of ``target ~ k_a ambient + k_d diffuse + k_s lobe(n)``, all k at least 0.
 
@@ -243,6 +246,7 @@ def solve(
             out; 0 for a highlight whose centre is seen.
         scale: from the exponent to what k_s is divided by to give the coefficient whose error is asked for, such as
             `brdf.NormalizedPhong.scale`; None for 1.
+        alike: of many targets under `jax.vmap` all else is the same: a third less time.
 
     Returns:
         The optimum; differentiable in all arrays, those that ``lobe`` closes over too.
@@ -287,7 +291,7 @@ def solve(
         return jnp.where(inside, by_n, log_n), jnp.where(x > 0, by_x, x)
 
     def search(_: Any, start: tuple[Array, Array]) -> tuple[Array, Array]:
-        return start if lobe is None else _search(pixels, relative, jnp.linspace(low, high, 1 + cells), start[1])
+        return start if lobe is None else _search(pixels, relative, jnp.linspace(low, high, 1 + cells), start[1], alike)
 
     def tangent(apply: Callable[[Any], Any], right: Any) -> Any:
         operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: right))
@@ -310,7 +314,9 @@ def solve(
     return Solution(k_a, k_d, k_s, n, least, (*(error.T * units), n * n_error))
 
 
-def _search(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, matt: Array) -> tuple[Array, Array]:
+def _search(
+    pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, matt: Array, alike: bool
+) -> tuple[Array, Array]:
     """The logarithm of the best exponent, and the coefficients there."""
 
     def at(log_n: Array, x: Array) -> tuple[Array, Array, _Point]:
@@ -324,7 +330,10 @@ def _search(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, ma
         return jax.jvp(slope, (log_n,), (jnp.ones_like(log_n),), has_aux=True)
 
     residual = pixels.residual(matt, jnp.zeros_like(pixels.diffuse))
-    on_grid = jax.lax.map(lambda log_n: _sums(pixels, _with_slope(relative, log_n), residual), grid)
+    if alike:
+        on_grid = _sums_of_alike(pixels, relative, grid, residual)
+    else:
+        on_grid = jax.lax.map(lambda log_n: _sums(pixels, _with_slope(relative, log_n), residual), grid)
     profile = jax.vmap(lambda sums: _point(pixels.free, sums, matt))(on_grid)
     position, lowest = lowest_in_cells(grid, profile.cost, profile.slope)
     # What rounding leaves is no valley: of exponents that fit alike the smallest, whose lobe most pixels see.
@@ -374,15 +383,39 @@ def _totals_jvp(terms: Any, changes: Any) -> Any:
     return found[: len(found) // 2], found[len(found) // 2 :]
 
 
-def _sums(pixels: _Pixels, lobes: Sequence[Array], residual: Array) -> _Sums:
-    """Of the columns ambient, diffuse, and a lobe with its derivative by log n, (B, P) each; the residual is (C, P)."""
+def _weighted(pixels: _Pixels, lobes: Sequence[Array]) -> tuple[list[Array], Array]:
+    """Columns ambient, diffuse, a lobe and its derivative by log n, (B, P) each, and their products with each other."""
     columns = [jnp.ones_like(pixels.diffuse), pixels.diffuse, *lobes]
     weighted, size = [column * pixels.weight for column in columns], range(len(columns))
     pairs = [(i, j) for i in size for j in size if i <= j]
     found = dict(zip(pairs, _totals([weighted[i] * columns[j] for i, j in pairs]), strict=True))
     gram = jnp.stack([jnp.stack([found[min(i, j), max(i, j)] for j in size], axis=-1) for i in size], axis=-1)
+    return weighted, gram
+
+
+def _sums(pixels: _Pixels, lobes: Sequence[Array], residual: Array) -> _Sums:
+    """At an exponent with that lobe and derivative; the residual is (C, P)."""
+    weighted, gram = _weighted(pixels, lobes)
     *product, square = _totals([one * residual for one in (*weighted, pixels.weight * residual)])
     return _Sums(gram, jnp.stack(product, axis=-1), square)
+
+
+def _sums_of_alike(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, residual: Array) -> _Sums:
+    """`_sums` at each of some exponents, which pictures of one scene share but for a product of two matrices."""
+
+    def of_lobe(log_n: Array) -> tuple[Array, Array]:
+        weighted, gram = _weighted(pixels, _with_slope(relative, log_n))
+        return jnp.stack(weighted[2:]), gram
+
+    lobes, gram = jax.lax.map(of_lobe, grid)
+    (base, _), (channels, _) = pixels.diffuse.shape, residual.shape
+    # Channels that share the basis are rows of one matrix.
+    rows = residual.reshape(base, channels // base, -1)
+    of_lobes = jnp.einsum("gkbp,bcp->gbck", lobes, rows, precision="highest").reshape(len(grid), channels, -1)
+    linear = _sums(pixels, (), residual)
+    product = jnp.broadcast_to(linear.product, (len(grid), channels, 2))
+    square = jnp.broadcast_to(linear.square, (len(grid), channels))
+    return _Sums(gram, jnp.concatenate([product, of_lobes], axis=-1), square)
 
 
 def _point(free: Array, sums: _Sums, x: Array) -> _Point:

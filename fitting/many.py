@@ -211,9 +211,10 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
     both = zip(np.asarray(_seen(stack)), problem.masks, strict=False)
     seen = np.stack([one & (True if some is None else some) for one, some in both])
     exact = [target.codes is None and target.saturation is None for target in problem.targets]
-    plain = np.array(exact) & np.array(same) & np.asarray(_plain(targets, np.broadcast_to(seen, targets.shape[:3])))
-    if problem.model == "auto" or not plain.any():
+    plain = np.array(exact) & np.array(same)
+    if problem.model == "auto" or not (plain.any() and seen.any()):
         return plain & False, {}
+    ordinary = _plain(targets, np.broadcast_to(seen, targets.shape[:3]))  # is found out beside the fits
     model = brdf.MODELS[problem.model]
     if alike:
         scene, pixel = brdf.cast(scenes[0], problem.precision), np.flatnonzero(seen)
@@ -247,7 +248,7 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
     for name, value, error, by in zip(NAMES, (k_a, k_d, k_s), errors, factors, strict=False):
         numbers |= {name: value / by, f"{name}_error": error / by}
     with np.errstate(invalid="ignore", divide="ignore"):
-        return plain, numbers | {"residual": np.sqrt(cost.sum(axis=1) / square[:, 0])}
+        return plain & np.asarray(ordinary), numbers | {"residual": np.sqrt(cost.sum(axis=1) / square[:, 0])}
 
 
 def _structure(scene: brdf.Scene) -> tuple[Any, ...]:
@@ -280,7 +281,8 @@ def _solved(
         given = picture | shared
         counts = given["weight"][:, None] > 0
         values = jnp.where(counts, given["target"].reshape(len(counts), -1), 0)
-        return ravel_pytree((functional.fit_basis(model, **given, n_range=n_range), jnp.sum(values * values)))[0]
+        solution = functional.fit_basis(model, **given, n_range=n_range, alike=bool(shared))
+        return ravel_pytree((solution, jnp.sum(values * values)))[0]
 
     return jax.lax.map(fit, pictures, batch_size=BATCH)
 
