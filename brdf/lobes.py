@@ -37,8 +37,8 @@ And rows from which on XLA's product of two matrices is a quick one."""
 STACKED_VALUES = 1 << 26
 """Up to so many values the fit keeps the terms of many samples, too, for few pixels: 256 MiB in float32."""
 
-NODES, STEP, NARROWEST, WIDEST = 5, 0.35, 0.04, 1.0
-"""A polynomial through so many exponents stands for a lobe over a range of log n: of 0.7 to 1e-5, of 0.04 to 1e-11. One
+NODES, STEP, NARROWEST, WIDEST = 6, 0.35, 0.04, 1.0
+"""A polynomial through so many exponents stands for a lobe over a range of log n: of 0.7 to 4e-6, of 0.04 to 1e-13. One
 through nodes so far apart, where the range is wider than `WIDEST`, to 1e-3, which serves to find where to look."""
 
 SHARED = half_log_cosine, mirror_log_cosine
@@ -247,12 +247,15 @@ class Near(NamedTuple):
     """Exponents at which a lobe of many samples is tabulated, once for all that is asked of it later.
 
     Attributes:
-        log_n: their logarithms, the nodes of Chebyshev over a range, increasing, (N,).
+        log_n: their logarithms, increasing, (N,): `NODES` exponents equally far apart, so that each lobe is the one
+            before times the same; or more, the nodes of Chebyshev over a range of log n.
         peak: about the largest logarithm of the lobe's cosine in any pixel, which the values are relative to.
+        fitted: what makes of the values the coefficients of their polynomial in log n by Chebyshev's, (N, N).
     """
 
     log_n: Any
     peak: Any
+    fitted: Any
 
     @property
     def narrow(self) -> bool:
@@ -261,33 +264,34 @@ class Near(NamedTuple):
 
     @property
     def ends(self) -> tuple[Any, Any]:
-        """Logarithms of the exponents between which it serves; the nodes end short of that."""
+        """Logarithms of the exponents between which it serves; the nodes of Chebyshev end short of that."""
         low, high = self.log_n[0], self.log_n[-1]
-        beyond = 0.5 * (high - low) * (1 / math.cos(0.5 * math.pi / self.log_n.size) - 1)
+        beyond = 0.0 if self.narrow else 0.5 * (high - low) * (1 / math.cos(0.5 * math.pi / self.log_n.size) - 1)
         return low - beyond, high + beyond
 
     @classmethod
     def between(cls, low: float, high: float, peak: float) -> "Near":
         """The nodes between two logarithms of n."""
-        count = NODES + (math.ceil((high - low) / STEP) if high - low > WIDEST else 0)
         # Nodes too close to each other would make slopes of rounding.
-        log_n = 0.5 * (low + high) + 0.5 * max(high - low, NARROWEST) * chebyshev.chebpts1(count)
-        return cls(log_n, np.float64(peak))
+        middle, reach = 0.5 * (low + high), 0.5 * max(high - low, NARROWEST)
+        if high - low > WIDEST:
+            nodes = chebyshev.chebpts1(NODES + math.ceil((high - low) / STEP))
+        else:
+            nodes = np.log(np.linspace(math.exp(-reach), math.exp(reach), NODES)) / reach
+        fitted = np.linalg.inv(chebyshev.chebvander(nodes, nodes.size - 1))
+        return cls(middle + reach * nodes, np.float64(peak), fitted)
 
     def weights(self, xp: Any, log_n: Any) -> tuple[Any, Any]:
         """What multiplies the values at the nodes to give that of their polynomial, and its derivative, (..., N)."""
         count, (low, high) = self.log_n.size, self.ends
-        nodes, half = chebyshev.chebpts1(count), 0.5 * (high - low)
-        # The polynomials of Chebyshev are orthogonal over the nodes.
-        at_nodes = chebyshev.chebvander(nodes, count - 1).T * (2 / count)
-        at_nodes[0] /= 2
-        slopes = chebyshev.chebval(nodes, chebyshev.chebder(np.eye(count))).T @ at_nodes
+        half = 0.5 * (high - low)
         u = (xp.clip(log_n, low, high) - 0.5 * (low + high)) / half
         values = [xp.ones_like(u), u]
         for _ in range(count - 2):
             values.append(2 * u * values[-1] - values[-2])
-        weights = xp.stack(values, axis=-1) @ xp.asarray(at_nodes, u.dtype)
-        return weights, weights @ xp.asarray(slopes, u.dtype) / half
+        polynomials, fitted = xp.stack(values, axis=-1), xp.asarray(self.fitted, u.dtype)
+        slopes = xp.asarray(chebyshev.chebder(np.eye(count)), u.dtype) @ fitted
+        return polynomials @ fitted, polynomials[..., :-1] @ slopes / half
 
 
 @pytree
@@ -479,7 +483,12 @@ def tabulated(
 
     def of_terms(terms: LightTerms) -> Any:
         n = jnp.exp(jnp.asarray(near.log_n)).astype(terms.weight.dtype) if model.lobes else []
-        return terms.diffuse, [_relative(one, near.peak, terms)[0] for one in n]
+        if not model.lobes or not near.narrow:
+            return terms.diffuse, [_relative(one, near.peak, terms)[0] for one in n]
+        values, step = [_relative(n[0], near.peak, terms)[0]], _powers(n[1] - n[0], near.peak, terms.log_cosine)[0]
+        for _ in range(NODES - 1):
+            values.append(values[-1] * step)
+        return terms.diffuse, values
 
     (diffuse, values), peak = over_samples(model, points.in_components(), lighting, of_terms)
     return diffuse, peak, jnp.stack(values, axis=1) if values else None

@@ -150,8 +150,10 @@ def replaced(optimum: Optimum, parts: Coupled, x: Float[np.ndarray, "3 C"], n: f
     """An optimum with the sums of each channel for itself, all else as it was; each value has the noise 1."""
     scale = np.array([1.0, 1.0, 1.0, 1 / n])
     gram = np.einsum("ccij->cij", parts.gram) * np.outer(scale, scale)
-    product = parts.score * scale + (gram[..., :3] @ x.T[..., None])[..., 0]
-    return dataclasses.replace(optimum, n=n, x=x, cost=optimum.pixels, gram=gram, product=product)
+    shown = (gram[..., :3] @ x.T[..., None])[..., 0]
+    product = parts.score * scale + shown
+    square = optimum.pixels + np.sum((2 * product - shown)[:, :3] * x.T, axis=1)
+    return dataclasses.replace(optimum, n=n, x=x, cost=optimum.pixels, gram=gram, product=product, square=square)
 
 
 def each_alone(

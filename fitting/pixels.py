@@ -193,7 +193,7 @@ class Statistics(NamedTuple):
         largest: finite value of any channel.
         top: how many pixels share it.
         least: value of any pixel, seen or not.
-        scale: largest size of a value that counts, (C,).
+        scale: largest size of a value that counts and is not clipped, (C,).
     """
 
     counts: Any
@@ -406,7 +406,7 @@ def _count(values: Any, allowed: Any, level: float, dark: float, *, apart: bool,
     below = finite & (brightest < level)
     good = (finite & (dimmest < level) if apart else below) & (brightest > dark)
     masks, bright = (finite, below, good), xp.where(finite, brightest, -xp.inf)
-    sizes = [xp.where(good, xp.abs(values[:, channel]), 0) for channel in range(values.shape[1])]
+    sizes = [xp.where(good & (one < level), xp.abs(one), 0) for one in (values[:, c] for c in range(values.shape[1]))]
     terms = [*(mask.astype(np.int32) for mask in masks), bright, *sizes]
     found = totals(terms, ["add"] * len(masks) + ["maximum"] * (1 + len(sizes)), (0,))
     counts, (largest, *scale) = found[: len(masks)], found[len(masks) :]
@@ -461,7 +461,7 @@ def _left_out(
     if level is not None:
         left_out["clipped"] = finite - below
         if not max(below, counted) or (below < finite and counted and black):
-            what = f"is clipped at {level:g} wherever it sees the object"
+            what = f"is clipped at {level:g} {'or black ' * bool(counted)}wherever it sees the object"
             raise InputError("target", what, "Give a darker exposure or a higher saturation")
     if dark is not None:
         left_out["dark"] = below - counted

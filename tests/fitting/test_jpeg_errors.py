@@ -57,6 +57,18 @@ def test_what_the_codec_takes_from_colours_is_made_good(tmp_path, monkeypatch):
     assert k_s < 0.75
 
 
+def test_a_dark_picture_keeps_its_numbers(tmp_path):
+    """Sums in units of the noise were held against the picture in those of light: ambient and diffuse were lost."""
+    one = ball(2, channels=3, size=48)
+    scene, dark = one.scene(), 0.1
+    light = brdf.DirectionalLight(direction=scene.lights[0].direction, intensity=dark * scene.lights[0].emittance)
+    scene = dataclasses.replace(scene, lights=(light,), ambient=dark * np.asarray(scene.ambient))
+    picture = File(1.0, curve="srgb", suffix=".jpg", quality=QUALITY, channels=3).picture
+    result = fitting.fit(picture(dark * one.drawn(), 2, tmp_path), scene)
+    assert not [own.key for own in result.parameters if own.reason]
+    np.testing.assert_allclose(result.material.k_d, one.k[1], atol=0.02)
+
+
 def test_a_joint_fit_takes_off_what_the_codec_does_and_tells_what_is_left(tmp_path):
     """Numbers were 4 of their errors off, root mean square."""
     off = []
