@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from brdf.arguments import Layer, Table
-from brdf.checks import direction_value, spectrum
+from brdf.checks import direction_value, spectrum, vector
 from brdf.errors import InputError
 from brdf.files import read_toml, utf8_name, write_text
 from brdf.geometry.camera import CAMERAS
@@ -93,8 +93,11 @@ def _mask(visibility: Path, visibility_layer: Layer | None = None):
     return _layer(visibility, read_layers(visibility), visibility_layer)[..., 0]
 
 
-def _points(file: Path, position: Layer | None = None, normal: Layer | None = None, to_view=None):
-    """Surface points from the layers of an image file, and whether their positions are among them."""
+def _points(file: Path, position: Layer | None = None, normal: Layer | None = None, to_view=None, eye=None):
+    """Surface points from the layers of an image file, and whether their positions are among them.
+
+    They are seen from the eye of a perspective picture, or from far away in a direction.
+    """
     towards = (0, 0, 1) if to_view is None else direction_value("to_view", to_view)
     layers = read_layers(file)
     normals = _layer(file, layers, normal, "normal", "sh_normal", "N")
@@ -102,6 +105,11 @@ def _points(file: Path, position: Layer | None = None, normal: Layer | None = No
         raise InputError(file, f"has no layer of normals, got {_named(layers)}", 'Name the layer: normal = "..."')
     positions = _layer(file, layers, position, "position", "P")
     towards = layers.get("to_view", towards) if to_view is None else towards
+    if eye is not None:
+        place = vector("eye", eye)
+        if positions is None:
+            raise InputError(file, "has no layer of positions, which an eye sees", 'Name it: position = "..."')
+        towards = place - positions
     return SurfacePoints.from_normals(normals, position=positions, to_view=towards), positions is not None
 
 

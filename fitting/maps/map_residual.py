@@ -43,7 +43,7 @@ OTHER, DEVIATIONS = 1.1, 8.0
 """A photograph stands apart that is this factor off, and so many times as far as is usual."""
 
 MOST_OTHERS = 0.1
-"""Where more than this share of the photographs stand apart it is not their lights."""
+"""Where more than this share is that factor off all of these stand apart, and it may be that the models do not hold."""
 
 
 class Left(NamedTuple):
@@ -141,14 +141,16 @@ def lights_apart(left: Left, names: Sequence[str]) -> tuple[str, ...]:
         if np.count_nonzero(some) >= FEWEST:
             factor[index] = np.clip(1, *np.quantile(left.values[index][some] / shown[index][some], (0.25, 0.75)))
     off = np.abs(np.log(np.maximum(factor, np.finfo(float).tiny)))
-    apart = off > max(np.log(OTHER), DEVIATIONS * float(np.median(off)))
-    count = int(np.count_nonzero(apart))
-    if not 0 < count <= MOST_OTHERS * len(names):
+    apart = off > np.log(OTHER)
+    many = np.count_nonzero(apart) > MOST_OTHERS * len(names)
+    count = int(np.count_nonzero(apart & (many | (off > DEVIATIONS * float(np.median(off))))))
+    if not count:
         return ()
     worst = int(np.argmax(off))
     others = f", and {count - 1} more stand apart" if count > 1 else ""
     what = f"{names[worst]} is {max(factor[worst], 0):.2g} times as bright as the others explain it{others}"
-    return (f"{what}: check intensities, exposures and directions of the lights",)
+    doubt = ", or no model holds for this surface" if many else ""
+    return (f"{what}: check intensities, exposures and directions of the lights{doubt}",)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -216,6 +216,17 @@ def test_layers_of_an_aov_file_can_be_named(tmp_path: Path):
     np.testing.assert_array_equal(points.position[0, 0], [0, 0, 2])
 
 
+def test_points_of_a_perspective_picture_are_seen_from_an_eye(tmp_path: Path):
+    text = CAMERA.replace("orthographic", "perspective").replace("width = 2.2", "fov = 40.0") + SPHERE
+    points = brdf.Scene.load(write(tmp_path, text + LIGHT)).surface_points()
+    seen = np.asarray(points.mask)
+    layers = {name: np.where(seen[..., None], getattr(points, name), 0) for name in ("position", "normal")}
+    write_layers(tmp_path / "aovs.exr", {name: layer.astype(np.float32) for name, layer in layers.items()})
+    again = brdf.Scene.load(write(tmp_path, '[aov]\nfile = "aovs.exr"\neye = [0, 0, 4]\n' + LIGHT)).surface_points()
+    np.testing.assert_array_equal(again.mask, seen)
+    np.testing.assert_allclose(np.asarray(again.to_view)[seen], np.asarray(points.to_view)[seen], atol=1e-6)
+
+
 def test_the_unnamed_layer_of_an_aov_file_is_named_by_nothing(tmp_path: Path):
     normal = np.broadcast_to([0.0, 0.0, 1.0], (4, 5, 3))
     write_layers(tmp_path / "aovs.exr", {"": normal, "position": normal})
@@ -310,6 +321,8 @@ REFUSED = {
     "to_view is zero": (AOV + "to_view = [0, 0, 0]\n" + LIGHT, r"aov\.to_view: must not have zero length"),
     "to_view is ragged": (AOV + "to_view = [[0], 0, 1]\n" + LIGHT, r"aov\.to_view: must be three numbers"),
     "to_view is short": (AOV + "to_view = [0, 1]\n" + LIGHT, r"aov\.to_view: must be three numbers"),
+    "an eye without positions": (AOV + "eye = [0, 0, 4]\n" + LIGHT, r"n\.exr: has no layer of positions, which an eye"),
+    "eye is short": (AOV + "eye = [0, 1]\n" + LIGHT, r"aov\.eye: must be three numbers"),
     "no positions": (AOV + POINT, r"aov: has no layer of positions, but .* lights stand somewhere\. Add the layer"),
     "occluders": (
         AOV + '[[shapes]]\ntype = "sphere"\ncenter = [0, 0, 2]\nradius = 0.5\nfitted = false\n' + LIGHT,

@@ -101,6 +101,16 @@ def test_a_photograph_whose_light_is_not_so_bright_is_named(factor: float, told:
     assert re.search(rf"^pictures\[10\] {told} as bright", notes) if told else not notes
 
 
+def test_many_photographs_whose_lights_are_not_so_bright_are_told():
+    """More than a tenth of them were told as none."""
+    lights = dome(32)
+    pictures, truth = texels(256, 0.004, lights)
+    pictures[2::8] *= 1.3
+    notes = " ".join(fitting.fit_maps(pictures, lights, truth["normal"][None]).notes)
+    assert re.search(r"^pictures\[\d+\] is 1\.[23]\d? times as bright .*, and 3 more stand apart", notes)
+    assert "or no model holds" in notes
+
+
 def test_a_photograph_in_shadow_and_texels_without_values_tell_of_no_light():
     lights = dome(32)
     pictures, truth = texels(256, 0.004, lights)
