@@ -44,7 +44,8 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     def products(to_light):
         """Of the columns of k_d and k_s and the derivative by ln n: the upper triangle of their Gram matrix, (6, T)."""
         lights = Distant(Components(tuple(to_light[:, None])), Components(tuple(to_view)), None)
-        columns = [one[:, 0] for one in columns_of(models, chosen, log_n, normal, lights)]
+        columns = columns_of(models, chosen, log_n, 1, lambda texels: texels.facing(normal, lights))
+        columns = [one[:, 0, 0] for one in columns]
         return jnp.stack([a * b for i, a in enumerate(columns) for b in columns[i:]])
 
     def information_by(light: Any) -> np.ndarray:

@@ -1,6 +1,6 @@
 """What some texels leave of their photographs: how noise grows with brightness, and which lights are not as they say.
 
-Some texels are fitted as if noise were even in codes, under distant lights. All together they tell how its variance
+Some texels are fitted as if noise were even in codes. All together they tell how its variance
 goes with what is shown. A camera's is kept where it is likelier than even noise, and no less likely than a noise of its
 own for each texel, as where models do not hold: then nothing is known of a camera.
 """
@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from brdf.precision import working_precision
-from brdf.vectors import Components
+from brdf.vectors import Components, normalize
 from fitting.likelihood import encoded_and_slope
 from fitting.maps.input_guesses import some_layers
-from fitting.maps.texels import OUTLIER, Distant, columns_of
-from fitting.maps.tiles import MapProblem
+from fitting.maps.texels import OUTLIER, Distant, Texels, columns_of
+from fitting.maps.tiles import MapProblem, near
 from fitting.uncertainty.noise_model import RISE, growth_of_channel
 
 MOST_VALUES = 1 << 17
@@ -65,18 +65,22 @@ class Left(NamedTuple):
 
 
 def left_by_some(problem: MapProblem) -> Left | None:
-    """What some texels leave under distant lights; None under others, or where there are no texels."""
+    """What some texels leave; None where there are no texels."""
     given = problem.photographs
-    if given.to_light is None or not problem.texels.size:
+    if not problem.texels.size:
         return None
     count, channels, ambient = len(given.each), given.size[2], problem.ambient
     texels, layers = some_layers(problem)
     stride = -(-texels.size * count * channels // MOST_VALUES)
     texels, layers = texels[::stride], {name: layer[::stride] for name, layer in layers.items()}
-    values = problem.tiles(texels)[0][:count].reshape(count, -1, channels)[:, : texels.size]
+    values, surface = problem.tiles(texels)
+    values = values[:count].reshape(count, -1, channels)[:, : texels.size]
+    points = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: texels.size], surface.points)
     with working_precision(problem.precision):
-        numbers = [layers[name] for name in ("k_d", "fitted_k_s", "fitted_n", "normal", "chosen")]
-        explained = np.asarray(_explained(problem.models, given.to_light, problem.to_view, *numbers), np.float64)
+        lights = given.to_light, problem.to_view, layers["normal"]
+        lights = lights if points is None else (points, *problem.near_lights())
+        numbers = [layers[name] for name in ("k_d", "fitted_k_s", "fitted_n", "chosen")]
+        explained = np.asarray(_explained(problem.models, count, points is None, lights, *numbers), np.float64)
     explained = explained if ambient is None else explained + ambient[:, None] * layers["k_a"]
     shown = explained * given.unit[:, None]
     both = zip(shown, given.each, strict=True)
@@ -153,19 +157,28 @@ def lights_apart(left: Left, names: Sequence[str]) -> tuple[str, ...]:
     return (f"{what}: check intensities, exposures and directions of the lights{doubt}",)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def _explained(
     models: Sequence[Any],
-    to_light: Array,
-    to_view: Array,
+    photographs: int,
+    distant: bool,
+    lights: tuple[Any, ...],
     k_d: Array,
     k_s: Array,
     n: Array,
-    normal: Array,
     chosen: Array,
 ) -> Float[Array, "P T C"]:
-    """What the materials of texels show under distant lights, without ambient light."""
-    to_view = to_view / jnp.linalg.norm(to_view)
-    lights = Distant(*(Components(tuple(one.T.astype(n.dtype))) for one in (to_light, to_view)), ambient=None)
-    diffuse, lobe, _ = columns_of(models, chosen, jnp.log(n), Components(tuple(normal.T)), lights)
-    return jnp.moveaxis(diffuse[..., None] * k_d[:, None] + lobe[..., None] * k_s[:, None], 0, 1)
+    """What the materials of texels show without ambient light.
+
+    The lights are distant ones, the view and the texels' normals; or the texels' points and what `near` takes.
+    """
+
+    def lit(texels: Texels) -> Texels:
+        if not distant:
+            points, stacks, occluders = lights
+            return near(texels, stacks, occluders, None, points)
+        to_light, to_view, normal = (Components(tuple(jnp.asarray(one, n.dtype).T)) for one in lights)
+        return texels.facing(normal, Distant(to_light, normalize(to_view), ambient=None))
+
+    diffuse, lobe, _ = columns_of(models, chosen, jnp.log(n), photographs, lit)
+    return jnp.moveaxis(diffuse * k_d[:, None] + lobe * k_s[:, None], 0, 1)

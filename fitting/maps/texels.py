@@ -438,18 +438,21 @@ class Texels(eqx.Module):
         return fit._replace(cost=jnp.sum(*sums(left * left), axis=0))
 
 
-def columns_of(models: Sequence[Any], chosen: Any, log_n: Array, normal: Components, lights: Distant) -> list[Array]:
-    """The columns of k_d and k_s, and the derivative of the latter by log n, (T, P) each; texels have chosen models.
+def columns_of(
+    models: Sequence[Any], chosen: Any, log_n: Array, photographs: int, lit: Callable[[Texels], Texels]
+) -> list[Array]:
+    """The columns of k_d and k_s, and the derivative of the latter by log n, (T, P, C) each or (T, P, 1).
 
-    The lights are of intensity 1; of a model without a lobe the last two are 0.
+    Texels have chosen models; ``lit`` gives those of one their columns. Of a model without a lobe the last two are 0.
     """
-    one = jnp.ones((1, log_n.size, lights.to_light.parts[0].size), log_n.dtype)
-    found = [jnp.zeros_like(one[0])] * 3
+    one = jnp.ones((1, log_n.size, photographs), log_n.dtype)
+    found = [jnp.zeros_like(one[0])[..., None]] * 3
     for index, model in enumerate(models):
-        texels = Texels(model, False, 1, one, Components(tuple(one))).facing(normal, lights)
+        texels = lit(Texels(model, False, 1, one, Components(tuple(one))))
         own = *texels.columns(log_n), *texels.by_log_n(log_n)
-        mine = (chosen == index)[:, None]
-        found = [jnp.where(mine, new.parts[0] if new else 0, old) for new, old in itertools.zip_longest(own, found)]
+        mine = (chosen == index)[:, None, None]
+        own = [jnp.stack(new.parts, axis=-1) for new in own]
+        found = [jnp.where(mine, new, old) for new, old in itertools.zip_longest(own, found, fillvalue=0)]
     return found
 
 

@@ -145,6 +145,13 @@ class MapProblem:
         values = self.photographs.tiles(texels, (size // tile, tile), LANES, self.precision)
         return values, jax.tree.map(cut, self.surface)
 
+    def near_lights(self) -> tuple[Any, Any]:
+        """Stacks of the lights of scenes, and what casts shadows there; none where lights are distant."""
+        scenes = self.photographs.scenes
+        if scenes is None:
+            return (), ()
+        return stacked([scene.lights[0] for scene in scenes], np.dtype(self.precision)), scenes[0].occluders
+
     def fit(self, values: np.ndarray, surface: Surface, band: int = 0) -> dict[str, np.ndarray]:
         """The layers of some tiles, (N * TILE, ...); what a lane without a texel has comes after those with one.
 
@@ -156,10 +163,6 @@ class MapProblem:
         kind = self.models, self.grey, self.finer, self.seek, self.refine
         static = *kind, (*curves, *curves[-1:] * black), bool(self.growth)
         with working_precision(self.precision):
-            stacks, occluders = (), ()
-            if given.scenes is not None:
-                stacks = stacked([scene.lights[0] for scene in given.scenes], dtype)
-                occluders = given.scenes[0].occluders
             to_light = np.zeros((len(curves), 3)) if given.to_light is None else given.to_light
             of_photographs = [np.array([one.top for one in given.each]), 1 / given.unit, _weights(given.unit), to_light]
             of_photographs += [] if self.ambient is None else [self.ambient]
@@ -170,7 +173,7 @@ class MapProblem:
             rounding = max(one.step for one in given.each) / np.sqrt(12 * np.mean(given.unit**2))
             prices = np.array(self.prices or [0.0] * len(self.models), dtype)
             growth = np.array(self.growth or [1, 0], dtype)
-            more = dtype.type(rounding), prices, growth, view.astype(dtype), stacks, occluders
+            more = dtype.type(rounding), prices, growth, view.astype(dtype), *self.near_lights()
             # All tiles that hold a texel, and the first lane that holds none.
             _, count, tile, _ = values.shape
             used, found, size = np.arange(count) <= np.count_nonzero(surface.mask) // tile, [], tiles_of_program(tile)
@@ -265,7 +268,7 @@ def _program(
                 if points is None:
                     texels = texels.facing(normal, lights)
                 else:
-                    texels = _near(texels, stacks, occluders, ambient, points)
+                    texels = near(texels, stacks, occluders, ambient, points)
                 best = texels.unshadowed()
                 fit = best.found
                 layers = _of_normals(texels, best, mask, normal, rounding, shared, seek, lights if refine else None)
@@ -310,7 +313,7 @@ def _slopes(curves: tuple[Encoding, ...], shown: Array, explained: Array) -> Arr
     return jnp.select(which, found)
 
 
-def _near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | None, points: Any) -> Texels:
+def near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | None, points: Any) -> Texels:
     """With the columns of lights of any kind at the points of a tile, (T,)."""
 
     def columns(points):

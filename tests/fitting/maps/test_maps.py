@@ -515,6 +515,25 @@ def test_near_lights_and_cast_shadows_of_a_scene():
     )
 
 
+def test_under_near_lights_too_noise_grows_and_a_photograph_stands_apart():
+    """As if even in codes: n, k_d and k_s were 1.4, 1.2 and 1.5 errors off; no photograph was told."""
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=1.4, resolution=(24, 24))
+    sphere, truth = brdf.Sphere([0, 0, 0], 1.0), brdf.BlinnPhong(k_d=0.4, k_s=0.3, n=20.0)
+    scenes = [brdf.Scene(camera, [sphere], lights=[brdf.PointLight(2.5 * spot, 2.25)]) for spot in dome(32)]
+    clean, random = np.stack([brdf.render(truth, scene) for scene in scenes]), np.random.default_rng(0)
+    noise = np.sqrt(0.001**2 + 0.02**2 * clean) * random.normal(size=clean.shape)
+    pictures = list((clean + noise).astype(np.float32))
+    maps = fitting.fit_maps(pictures, scenes, model="blinn-phong")
+    known = maps.determined
+    assert known.mean() > 0.5
+    assert not maps.notes
+    for name in ("k_d", "k_s", "n"):
+        off = (getattr(maps, name) - getattr(truth, name)) / getattr(maps, f"{name}_error")
+        assert np.sqrt(np.mean(off[known] ** 2)) < 1.12, name
+    pictures[20] = 2 * pictures[20]
+    assert fitting.fit_maps(pictures, scenes, model="blinn-phong").notes[0].startswith("pictures[20] is")
+
+
 def test_lights_of_several_kinds_light_one_view():
     """Of so many samples each: their columns were not of one size."""
     camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(6, 6))
