@@ -3,6 +3,7 @@
 import atexit
 import gc
 import os
+from pathlib import Path
 
 import pytest
 from project_paths import ROOT
@@ -15,6 +16,17 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.setdefault("PYTHONWARNINGS", "ignore:Error reading persistent compilation cache entry")
 # Tracing makes many objects that live: to look for cycles as often as Python does is a fifth of what is not compiling.
 gc.set_threshold(200_000, 20, 100)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_pieces_of_memory():
+    """Linux lets a process have 65,530, of which each compiled program takes a dozen: beyond them it crashes."""
+    yield
+    pieces = Path("/proc/self/maps")
+    if pieces.exists() and pieces.read_bytes().count(b"\n") > 32_000:
+        import jax  # what is set above holds when it loads
+
+        jax.clear_caches()
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -68,7 +68,7 @@ def noisy():
 @pytest.mark.parametrize("kind", ["linear", "srgb, in light", "srgb"])
 def test_noise_of_a_camera_and_of_a_curve_moves_nothing_and_is_in_the_errors(kind):
     """As if even in codes: errors of ln n of linear values were 1.3 times too small, k_d of sRGB 2.5 % too dark."""
-    lights = dome(36)
+    lights = dome(32)
     pictures, truth = texels(432, 0.0, lights, n=(20, 150))
     random, size = np.random.default_rng(5), 1 / 1.6
     pictures *= size
@@ -334,9 +334,8 @@ def test_an_n_that_a_texel_shares_with_none_errs_as_its_own():
     lights, random, normal = dome(32), np.random.default_rng(0), np.broadcast_to(VIEW, (300, 3))
     k_d, k_s = random.uniform(0.03, 0.5, (300, 1)), random.uniform(0.1, 0.8, (300, 1))
     pictures = seen_by_equation(lights, normal, k_d, k_s, 8.0) + 0.01 * random.normal(size=(32, 1, 300, 3))
-    options = {"specular": "grey", "precision": "float64"}
-    own = fitting.fit_maps(pictures, lights, normal[None], **options)
-    shared = fitting.fit_maps(pictures, lights, normal[None], labels=np.arange(300)[None], **options)
+    own = fitting.fit_maps(pictures, lights, normal[None], precision="float64")
+    shared = fitting.fit_maps(pictures, lights, normal[None], labels=np.arange(300)[None], precision="float64")
     assert np.mean(own.determined == shared.determined) > 0.95
     known = own.determined & shared.determined & np.all(own.k_d > 0, axis=-1)
     np.testing.assert_allclose(shared.n[known], own.n[known], rtol=1e-6)
@@ -519,7 +518,7 @@ def test_under_near_lights_too_noise_grows_and_a_photograph_stands_apart():
     """As if even in codes: n, k_d and k_s were 1.4, 1.2 and 1.5 errors off; no photograph was told."""
     camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=1.4, resolution=(24, 24))
     sphere, truth = brdf.Sphere([0, 0, 0], 1.0), brdf.BlinnPhong(k_d=0.4, k_s=0.3, n=20.0)
-    scenes = [brdf.Scene(camera, [sphere], lights=[brdf.PointLight(2.5 * spot, 2.25)]) for spot in dome(32)]
+    scenes = [brdf.Scene(camera, [sphere], lights=[brdf.PointLight(2.5 * spot, 3 * [2.25])]) for spot in dome(32)]
     clean, random = np.stack([brdf.render(truth, scene) for scene in scenes]), np.random.default_rng(0)
     noise = np.sqrt(0.001**2 + 0.02**2 * clean) * random.normal(size=clean.shape)
     pictures = list((clean + noise).astype(np.float32))
@@ -916,7 +915,7 @@ def test_what_many_texels_share_is_not_always_clipped():
     black_and_white = (pictures > 0.5) * 0.7
     for given in (pictures, dark / 255, dark.astype(np.uint8), dark.astype(np.uint16), two, ball, black_and_white):
         given = np.broadcast_to(given, pictures.shape)
-        assert not fitting.fit_maps(given, lights, truth["normal"][None]).notes
+        assert "clipped" not in " ".join(fitting.fit_maps(given, lights, truth["normal"][None]).notes)
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e12, 1e20])
@@ -1183,7 +1182,7 @@ def test_two_devices_give_the_maps_of_one(tmp_path):
 
 
 def test_an_n_that_texels_share_is_the_optimum_of_all():
-    lights = dome(24)
+    lights = dome(32)
     pictures, truth = texels(60, 0.02, lights, seed=4)
     half = (lights + VIEW) / np.linalg.norm(lights + VIEW, axis=1)[:, None]
     labels, n = np.arange(60)[None] % 2, np.array([12.0, 40.0])[np.arange(60) % 2]
@@ -1323,7 +1322,8 @@ def test_another_ambient_light_is_another_problem(tmp_path):
 
 
 def test_labels_of_what_is_black(tmp_path):
-    maps = fitting.fit_maps(np.zeros((16, 1, 40, 3)), dome(16), np.broadcast_to(VIEW, (1, 40, 3)), labels=0)
+    given = np.zeros((32, 1, 40, 3)), dome(32), np.broadcast_to(VIEW, (1, 40, 3))
+    maps = fitting.fit_maps(*given, labels=0, precision="float64")
     assert not maps.k_d.any()
     assert np.all(np.isfinite(maps.k_d_error))
 
