@@ -110,8 +110,8 @@ def test_a_move_that_changes_nothing_is_none_of_a_light():
 
 def test_a_plane_that_faces_away_from_its_light_ends_no_diagnosis():
     light = brdf.RectangleLight([1.2, 1.5, 2.4], [0.8, 0, 0], [0, 0.8, 0], [12.0])  # shines away from the ball
-    told = dataclasses.replace(SCENE, lights=(light,))
-    assert fitted(drawn(), told).diagnosis is not None
+    told = dataclasses.replace(SMALL, lights=(light,))
+    assert fitted(drawn(SMALL), told).diagnosis is not None
 
 
 @pytest.mark.parametrize("true", ["phong", "normalized-blinn-phong"])
