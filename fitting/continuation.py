@@ -40,6 +40,8 @@ FEWEST_VALUES = 6.0
 STEP, MANY_VALUES, LONG_STEP = 2.0, 50.0, 4.0
 # Where the Hessian is no larger all values are surely inside their codes.
 NOTHING = 1e-100
+# Pixels whose products are taken at a time: they stay in a core's cache, and cores that shared a product would wait.
+PIECE = 1 << 13
 
 
 class Estimate(NamedTuple):
@@ -113,9 +115,13 @@ class PictureScore(NamedTuple):
 
     def sums(self) -> tuple[Float[np.ndarray, "C V V"], Float[np.ndarray, "C V"]]:
         """Products of the columns weighted by the values' weights, and with their scores."""
-        columns = np.moveaxis(self.columns, -1, 0)  # (C, V, P)
-        products = (columns * self.weight.T[:, None]) @ np.swapaxes(columns, 1, 2)
-        return products, (columns @ self.score.T[..., None])[..., 0]
+        columns, weight, score = np.moveaxis(self.columns, -1, 0), self.weight.T[:, None], self.score.T[:, None]
+        found = np.zeros((*columns.shape[:2], columns.shape[1] + 1))
+        for some in _pieces(columns.shape[2]):
+            own = columns[..., some]
+            both = np.concatenate([own * weight[..., some], score[..., some]], axis=1)
+            found += own @ np.swapaxes(both, 1, 2)
+        return found[..., :-1], found[..., -1]
 
 
 class Problem(ABC):
@@ -204,10 +210,17 @@ class Problem(ABC):
 
         squares = np.zeros(len(influence))
         for one in score.pictures:
-            shares = map(of_channel, self.places, np.moveaxis(one.columns, -1, 0), one.weight.T)
-            for share in [sum(shares)] if self.copies else shares:
-                squares += np.einsum("up,up->u", share, share)
+            columns, weight = np.moveaxis(one.columns, -1, 0), one.weight.T
+            for some in _pieces(columns.shape[2]):
+                shares = map(of_channel, self.places, columns[..., some], weight[:, some])
+                for share in [sum(shares)] if self.copies else shares:
+                    squares += np.einsum("up,up->u", share, share)
         return squares
+
+
+def _pieces(count: int) -> list[slice]:
+    """Of so many pixels those whose products are taken at a time."""
+    return [slice(first, first + PIECE) for first in range(0, count, PIECE)]
 
 
 def at_least_one(which: Bool[np.ndarray, " P"]) -> Bool[np.ndarray, " P"]:
