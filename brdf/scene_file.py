@@ -107,9 +107,12 @@ def _points(file: Path, position: Layer | None = None, normal: Layer | None = No
     towards = layers.get("to_view", towards) if to_view is None else towards
     if eye is not None:
         place = vector("eye", eye)
+        if to_view is not None:
+            raise InputError("eye", "is given beside to_view", "Give one of them")
         if positions is None:
             raise InputError(file, "has no layer of positions, which an eye sees", 'Name it: position = "..."')
-        towards = place - positions
+        if positions.shape[-1] == 3:  # others are refused below
+            towards = place - np.where(np.isfinite(positions), positions, 0)
     return SurfacePoints.from_normals(normals, position=positions, to_view=towards), positions is not None
 
 

@@ -39,6 +39,8 @@ from fitting.solver.normal_equations import COMPILER_OPTIONS
 
 # So many pictures at a time: their columns stay in the processor's cache.
 BATCH = 32
+# Of no more pixels lobes are kept at all exponents of the grid.
+FEW_PIXELS = 1 << 16
 NAMES = ("k_a", "k_d", "k_s", "n")
 
 
@@ -281,7 +283,8 @@ def _solved(
         given = picture | shared
         counts = given["weight"][:, None] > 0
         values = jnp.where(counts, given["target"].reshape(len(counts), -1), 0)
-        solution = functional.fit_basis(model, **given, n_range=n_range, alike=bool(shared))
+        alike = bool(shared) and len(counts) <= FEW_PIXELS
+        solution = functional.fit_basis(model, **given, n_range=n_range, alike=alike)
         return ravel_pytree((solution, jnp.sum(values * values)))[0]
 
     return jax.lax.map(fit, pictures, batch_size=BATCH)

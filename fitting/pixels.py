@@ -81,8 +81,8 @@ def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None)
     return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient, tile.bounds)
 
 
-def shown(material: brdf.Material, scene: brdf.Scene, precision: Precision) -> Float[np.ndarray, "H W C"]:
-    """What `brdf.render` makes of a fitted material; of a small picture by the program that the fit has loaded."""
+def drawn(material: brdf.Material, scene: brdf.Scene, precision: Precision) -> Float[np.ndarray, "H W C"]:
+    """What `brdf.render` makes of a fitted material; a small picture by programs that a fit has loaded."""
     (width, height), channels = scene.resolution, max(scene.channels, material.k_d.size)
     with working_precision(precision):
         colour, (grey,) = take_colour_out([cast(scene, precision)], channels)
@@ -92,7 +92,9 @@ def shown(material: brdf.Material, scene: brdf.Scene, precision: Precision) -> F
         nothing = jax.device_put(np.zeros((width * height, channels), precision))
         picture, n = picture_of(type(material), Tile(nothing, None, points, grey)), float(getattr(material, "n", 1.0))
         k = np.stack([np.broadcast_to(getattr(material, name, 0.0), channels) for name in ("k_a", "k_d", "k_s")])
-        values = picture.predict(n, k * coefficient_factors(type(material), n, colour))
+        # By the colour itself: of a channel without light the factor is 1.
+        by = coefficient_factors(type(material), n, np.ones(channels)) * [np.ones(channels), colour, colour]
+        values = picture.predict(n, k * by)
         return np.where(np.ravel(points.mask)[:, None], values, 0).reshape(height, width, channels)
 
 

@@ -17,7 +17,7 @@ from brdf.errors import InputError
 from brdf.materials.material_file import material_to_dict
 from brdf.precision import Precision
 from fitting.budget.choice import BudgetChoice
-from fitting.pixels import shown
+from fitting.pixels import drawn
 from fitting.selection import Candidate
 from fitting.solver.profile import Optimum
 
@@ -322,7 +322,7 @@ class FitResult(Parameters):
         Args:
             picture: which of the scenes.
         """
-        return shown(self.material, self.scenes[picture], self.precision)
+        return drawn(self.material, self.scenes[picture], self.precision)
 
     @property
     def causes_of_structure(self) -> tuple[Cause, ...]:

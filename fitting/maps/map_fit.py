@@ -59,8 +59,8 @@ def fit_maps(
     """Fit a material to every texel of one view under many lights: the global optimum of each, with errors.
 
     Values that are clipped, face away from their light or lie in a cast shadow do not count. Noise is even in codes, or
-    under distant lights grows with brightness, as that of a camera, where some texels say so. Exponents are sought from
-    1 to 65,536; at an end n is not determined.
+    grows with brightness, as that of a camera, where some texels say so. Exponents are sought from 1 to 65,536; at an
+    end n is not determined.
 
     Args:
         pictures: photographs of one size, (P, H, W, C) linear values or a list of arrays, `brdf.Picture`,

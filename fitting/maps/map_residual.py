@@ -20,7 +20,7 @@ from brdf.vectors import Components, normalize
 from fitting.likelihood import encoded_and_slope
 from fitting.maps.input_guesses import some_layers
 from fitting.maps.texels import OUTLIER, Distant, Texels, columns_of
-from fitting.maps.tiles import MapProblem, near
+from fitting.maps.tiles import TILE, MapProblem, near
 from fitting.uncertainty.noise_model import RISE, growth_of_channel
 
 MOST_VALUES = 1 << 17
@@ -71,7 +71,9 @@ def left_by_some(problem: MapProblem) -> Left | None:
         return None
     count, channels, ambient = len(given.each), given.size[2], problem.ambient
     texels, layers = some_layers(problem)
-    stride = -(-texels.size * count * channels // MOST_VALUES)
+    # Near lights have many samples: a tile's at a time.
+    most = texels.size if given.scenes is None else TILE
+    stride = max(-(-texels.size * count * channels // MOST_VALUES), -(-texels.size // most))
     texels, layers = texels[::stride], {name: layer[::stride] for name, layer in layers.items()}
     values, surface = problem.tiles(texels)
     values = values[:count].reshape(count, -1, channels)[:, : texels.size]
@@ -153,8 +155,9 @@ def lights_apart(left: Left, names: Sequence[str]) -> tuple[str, ...]:
     worst = int(np.argmax(off))
     others = f", and {count - 1} more stand apart" if count > 1 else ""
     what = f"{names[worst]} is {max(factor[worst], 0):.2g} times as bright as the others explain it{others}"
-    doubt = ", or no model holds for this surface" if many else ""
-    return (f"{what}: check intensities, exposures and directions of the lights{doubt}",)
+    doubt = "the models do not hold for this surface, or " if many else "check "
+    wrong = " are wrong" if many else ""
+    return (f"{what}: {doubt}intensities, exposures and directions of the lights{wrong}",)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

@@ -42,6 +42,15 @@ def test_two_pictures_tell_what_one_does_not():
     assert "2 pictures" in str(both)
 
 
+def test_a_picture_under_a_lamp_of_one_colour_is_drawn_in_that_colour():
+    """Channels without light were drawn as bright as the others."""
+    lamps = [brdf.DirectionalLight(direction=[0.4, 0.5, 0.8], intensity=colour) for colour in ([1, 0, 0], [1, 1, 1])]
+    scenes = [ball_scene(lamp, ambient=None) for lamp in lamps]
+    result = fitting.fit([pictured(SHINY, scene) for scene in scenes], scenes, model="blinn-phong")
+    for index, scene in enumerate(scenes):
+        np.testing.assert_allclose(result.fitted(index), brdf.render(result.material, scene), atol=1e-6)
+
+
 def test_a_constant_picture_is_not_taken_for_a_clipped_one():
     result = fitting.fit(np.full_like(MATT, 0.5), SCENE, model="lambert")
     assert not result.left_out.get("clipped")

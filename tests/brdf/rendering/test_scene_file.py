@@ -322,6 +322,7 @@ REFUSED = {
     "to_view is ragged": (AOV + "to_view = [[0], 0, 1]\n" + LIGHT, r"aov\.to_view: must be three numbers"),
     "to_view is short": (AOV + "to_view = [0, 1]\n" + LIGHT, r"aov\.to_view: must be three numbers"),
     "an eye without positions": (AOV + "eye = [0, 0, 4]\n" + LIGHT, r"n\.exr: has no layer of positions, which an eye"),
+    "eye and to_view": (AOV + "eye = [0, 0, 4]\nto_view = [0, 0, 1]\n" + LIGHT, r"eye: is given beside to_view"),
     "eye is short": (AOV + "eye = [0, 1]\n" + LIGHT, r"aov\.eye: must be three numbers"),
     "no positions": (AOV + POINT, r"aov: has no layer of positions, but .* lights stand somewhere\. Add the layer"),
     "occluders": (
