@@ -108,7 +108,8 @@ def _tabulated(
 ) -> tuple[Array, Lobe | None]:
     index = np.flatnonzero(points.mask if counts is None else points.mask & counts)
     # Of one size for few numbers of pixels, or each would be compiled.
-    size = -(-index.size // TILE) * TILE if index.size > TILE else max(1 << (index.size - 1).bit_length(), TILE >> 2)
+    size = max(index.size, TILE >> 2)
+    size = -(-size // TILE) * TILE if size > TILE else 1 << (size - 1).bit_length()
     padded = np.resize(index if index.size else np.zeros(1, int), size)
     found = tabulated(OneOf.of(model), points.pixels(padded), lighting, near)
 

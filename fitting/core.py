@@ -23,7 +23,7 @@ from fitting.jpeg_errors import codec_of, without_codec_errors
 from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import bounds_of, highlight_in_codes, most_likely, unexplained
 from fitting.model_fit import ModelFit
-from fitting.pixels import Observed, observe, picture_of
+from fitting.pixels import Observed, observe
 from fitting.problem import FitProblem
 from fitting.result import FitResult
 from fitting.sample_error import MOST, between, near_exponent, nearer
@@ -36,6 +36,7 @@ from fitting.solver.profile import Optimum, refit, search, within_sight
 from fitting.solver.refinement import TOLERANCE_DOUBLE
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels, places_of
+from fitting.tile import picture_of
 from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_gain
 from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums

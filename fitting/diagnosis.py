@@ -34,11 +34,11 @@ from fitting.core import fit_pictures
 from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
 from fitting.likelihood import how_many_alike, weight_of_alike
 from fitting.model_fit import N_RANGE
-from fitting.pixels import Tile, picture_of
 from fitting.problem import state_problem
 from fitting.result import Cause, FitResult
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search, within_sight
+from fitting.tile import Tile, picture_of
 
 BLACK = (
     "subtract the camera's black level, or give the scene the [ambient] light that it lacks, a photograph --ambient, "

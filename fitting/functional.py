@@ -246,8 +246,8 @@ def solve(
             out; 0 for a highlight whose centre is seen.
         scale: from the exponent to what k_s is divided by to give the coefficient whose error is asked for, such as
             `brdf.NormalizedPhong.scale`; None for 1.
-        alike: of many targets under `jax.vmap` all else is the same: a third less time, of few pixels, for all lobes of
-            the grid are kept.
+        alike: under `jax.vmap` all but the target is the same: a third less time, while the lobes of all exponents of
+            the search are kept.
 
     Returns:
         The optimum; differentiable in all arrays, those that ``lobe`` closes over too.

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fitting.likelihood import Bounds, in_light, interval, is_curved, over_channels
-from fitting.pixels import Observed, Tile
+from fitting.pixels import Observed
 from fitting.solver.streams import each
+from fitting.tile import Tile
 from fitting.uncertainty.noise_model import CHANCE, EVEN, MOST_VALUES, RISE, growth_of_channel, variance_at
 
 _F = TypeVar("_F")

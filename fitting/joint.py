@@ -40,12 +40,13 @@ from fitting.joint_likelihood import Information, by_least_squares, most_likely_
 from fitting.joint_problem import JointProblem, Leaf, degrees_between, joint_problem, linearised, named_leaves
 from fitting.jpeg_errors import APPROACH, ENOUGH_CHANGE, MOST_FITS, LookAlikes, codec_of
 from fitting.model_fit import N_RANGE
-from fitting.pixels import Observed, Tile, observe
+from fitting.pixels import Observed, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter
 from fitting.solver.nnls import nonnegative_minimum, scaled_inverse
+from fitting.tile import Tile
 from fitting.uncertainty.covariance import LOST_IN_NOISE, RESOLUTION, SIGNIFICANT
 from fitting.uncertainty.intervals import NORMAL_95, above_zero, widened
 from fitting.uncertainty.noise_model import value_variance

@@ -17,9 +17,9 @@ from brdf.errors import InputError
 from brdf.materials.material_file import material_to_dict
 from brdf.precision import Precision
 from fitting.budget.choice import BudgetChoice
-from fitting.pixels import drawn
 from fitting.selection import Candidate
 from fitting.solver.profile import Optimum
+from fitting.tile import drawn
 
 NOT_DETERMINED = "not determined"
 # Beyond this relative error an interval of n is told: it is no longer symmetric.

@@ -13,10 +13,11 @@ from fitting.channel_errors import residuals
 from fitting.codes import all_between
 from fitting.likelihood import Bounds, residual_deviation
 from fitting.model_fit import ModelFit
-from fitting.pixels import Observed, Tile
+from fitting.pixels import Observed
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.streams import Stream, each
+from fitting.tile import Tile
 
 # The noise of one picture is this factor of another's, and it is likelier so by more than chance by so many deviations.
 UNEVEN, DEVIATIONS = 1.2, 5.0

@@ -155,9 +155,9 @@ def lights_apart(left: Left, names: Sequence[str]) -> tuple[str, ...]:
     worst = int(np.argmax(off))
     others = f", and {count - 1} more stand apart" if count > 1 else ""
     what = f"{names[worst]} is {max(factor[worst], 0):.2g} times as bright as the others explain it{others}"
-    doubt = "the models do not hold for this surface, or " if many else "check "
-    wrong = " are wrong" if many else ""
-    return (f"{what}: {doubt}intensities, exposures and directions of the lights{wrong}",)
+    lights = "intensities, exposures and directions of the lights"
+    remedy = f"the models do not hold for this surface, or {lights} are wrong" if many else f"check {lights}"
+    return (f"{what}: {remedy}",)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

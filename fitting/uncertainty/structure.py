@@ -250,9 +250,9 @@ def _left_out(
     root = np.linalg.svd(covariance, hermitian=True)
     root = root.U * np.sqrt(root.S)
     found, order = together.copy(), np.argsort(blocks, kind="stable")
-    ends = np.cumsum(np.bincount(blocks))
+    edges = np.append(0, np.cumsum(np.bincount(blocks)))
     for block in np.flatnonzero(np.bincount(blocks, weights=held) > LEAST_HELD):
-        hessian, some = np.zeros_like(covariance), slopes[:, order[ends[block - 1] if block else 0 : ends[block]]]
+        hessian, some = np.zeros_like(covariance), slopes[:, order[edges[block] : edges[block + 1]]]
         for c, place in enumerate(index):
             hessian[np.ix_(place, place)] += some[..., c] @ some[..., c].T
         values, vectors = np.linalg.eigh(root.T @ hessian @ root)

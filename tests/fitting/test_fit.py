@@ -133,7 +133,7 @@ REFUSED = [
     ({"noise": (0.0, 0.0)}, "noise: must be two numbers of 0 or more, not both 0"),
     ({"target": []}, "target: is an empty list"),
     ({"target": np.zeros((*WHOLE, 3))}, "target: is black on the object"),
-    ({"target": (MATT > [0.1, 0.2, 0.3]) * 1.0}, "target: is clipped at 0.999999 or black wherever it sees the object"),
+    ({"target": (MATT > [0.1, 0.2, 0.3]) * 1.0}, "target: is clipped at 1 or black wherever it sees the object"),
     ({"target": np.full((*WHOLE, 3), np.nan)}, "target: has no finite value"),
     ({"target": np.ones((10, 10, 3))}, "target: is 10 x 10"),
     ({"target": MATT[::2], "accuracy": 0.01}, f"target: is {SIZE} x {SIZE // 2}"),

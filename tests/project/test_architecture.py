@@ -24,7 +24,8 @@ brdf.geometry brdf.lights brdf.lobes brdf.pixel_area brdf.images brdf.scene_file
 brdf.materials brdf.measured brdf.plausibility brdf.display
 fitting.progress fitting.likelihood fitting.codes fitting.solver fitting.model_fit
 fitting.channel_errors fitting.continuation fitting.maximum_likelihood fitting.light_colour fitting.sample_error
-fitting.problem fitting.pixels fitting.selection fitting.budget.choice fitting.budget.sampling fitting.result
+fitting.problem fitting.tile fitting.pixels fitting.selection fitting.budget.choice fitting.budget.sampling
+fitting.result
 fitting.uncertainty fitting.uneven_noise fitting.growing_noise fitting.doubts fitting.jpeg_errors fitting.core
 fitting.joint_problem
 fitting.diagnosis fitting.report fitting.light_choice fitting.joint_likelihood fitting.joint

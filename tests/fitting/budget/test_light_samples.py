@@ -99,7 +99,7 @@ def test_the_interval_of_n_goes_on_beyond_what_was_tabulated_first():
     sky = brdf.EnvironmentMap((0.3 + 8 * sun)[..., None], samples=1024)
     scene, truth = ball(sky, 48), brdf.NormalizedPhong(k_d=0.3, k_s=0.01, n=200)
     clean, random = np.asarray(brdf.render(truth, scene)), np.random.default_rng(0)
-    for _ in range(3):
+    for _ in range(6):
         n = fitting.fit(clean + 0.003 * random.standard_normal(clean.shape), scene, model="normalized-phong")["n"]
         assert n.interval is not None
         assert 20 < n.interval[0] < n.interval[1]

@@ -913,9 +913,11 @@ def test_what_many_texels_share_is_not_always_clipped():
     ball = 0.8 * np.maximum(lights @ truth["normal"].T, 0)[:, None, :, None]
     ball[:, 0, :20] = 0.8 * np.cos(np.linspace(0, 0.1, 20))[:, None]  # about a maximum
     black_and_white = (pictures > 0.5) * 0.7
-    for given in (pictures, dark / 255, dark.astype(np.uint8), dark.astype(np.uint16), two, ball, black_and_white):
+    for given in (pictures, dark / 255, dark.astype(np.uint8), dark.astype(np.uint16), two, ball):
         given = np.broadcast_to(given, pictures.shape)
-        assert "clipped" not in " ".join(fitting.fit_maps(given, lights, truth["normal"][None]).notes)
+        assert not fitting.fit_maps(given, lights, truth["normal"][None]).notes
+    (note,) = fitting.fit_maps(black_and_white, lights, truth["normal"][None]).notes
+    assert "the models do not hold" in note
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e12, 1e20])
@@ -1322,8 +1324,7 @@ def test_another_ambient_light_is_another_problem(tmp_path):
 
 
 def test_labels_of_what_is_black(tmp_path):
-    given = np.zeros((32, 1, 40, 3)), dome(32), np.broadcast_to(VIEW, (1, 40, 3))
-    maps = fitting.fit_maps(*given, labels=0, precision="float64")
+    maps = fitting.fit_maps(np.zeros((16, 1, 40, 3)), dome(16), np.broadcast_to(VIEW, (1, 40, 3)), labels=0)
     assert not maps.k_d.any()
     assert np.all(np.isfinite(maps.k_d_error))
 
