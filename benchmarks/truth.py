@@ -229,6 +229,8 @@ COVERAGE = {
     "JPEG q75": File(curve="srgb", suffix=".jpg", quality=75),
     "colour JPEG q90": File(curve="srgb", suffix=".jpg", quality=90, channels=3),
     "colour JPEG q90, noise 1": File(1.0, curve="srgb", suffix=".jpg", quality=90, channels=3),
+    "colour JPEG q75": File(curve="srgb", suffix=".jpg", quality=75, channels=3),
+    "colour JPEG q75, noise 1": File(1.0, curve="srgb", suffix=".jpg", quality=75, channels=3),
 }
 LAMBERT = {
     "linear": File(),

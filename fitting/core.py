@@ -19,7 +19,7 @@ from brdf.lobes import Near
 from brdf.precision import working_precision
 from fitting.doubts import doubts
 from fitting.growing_noise import Shown, as_it_grows, likeliest
-from fitting.jpeg_errors import codec_of, without_codec_errors
+from fitting.jpeg_errors import allowing_for_codec, codec_of, without_codec_errors
 from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import bounds_of, highlight_in_codes, most_likely, unexplained
 from fitting.model_fit import ModelFit
@@ -407,9 +407,10 @@ def _less_codec_errors(
         value = [sum(_value(one, clean) for _, clean in found) for one in fits]
         best, clean = found[int(np.argmax(value))]
         if _coloured(best, clean):
-            return best, choice.coloured(best.model.name, best.free), clean
+            return allowing_for_codec(best, clean), choice.coloured(best.model.name, best.free), clean
     if known:
         fit, observed = without_codec_errors(observed, fit)
+        fit = allowing_for_codec(fit, observed)
     elif choice is None:
         fit = most_likely(fit)
     return fit, choice, observed

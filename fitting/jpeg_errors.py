@@ -4,7 +4,7 @@ A JPEG keeps brightness well and colours coarsely: in half the resolution, in la
 within a block that are below half a step. That errs the same way all over a smoothly lit object, so that no residual
 shows it and no error of blocks holds it. What it is a look-alike says: the prediction of a fit, with noise, through the
 same codec. The mean of what that changes is taken off the codes and the rest fitted again, until the picture differs
-from its look-alikes by no more than chance.
+from its look-alikes by no more than chance. How far numbers may be off until look-alikes show it is part of the errors.
 
 Sources: C. Gourieroux, A. Monfort and E. Renault, "Indirect inference", J. Applied Econometrics 8 (1993) S85;
 D. McFadden, "A method of simulated moments", Econometrica 57 (1989) 995.
@@ -12,7 +12,7 @@ D. McFadden, "A method of simulated moments", Econometrica 57 (1989) 995.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 
 from brdf.images.encoding import decode
 from brdf.images.jpeg import Jpeg
+from brdf.vectors import quotient
 from fitting.likelihood import Bounds
 from fitting.maximum_likelihood import bounds_of, change, most_likely
 from fitting.model_fit import ModelFit
@@ -28,6 +29,9 @@ from fitting.problem import Target
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit
 from fitting.solver.streams import each
+from fitting.solver.tied import design_of, join_channels
+from fitting.uncertainty.covariance import inverse_among
+from fitting.uncertainty.interpretation import alone_covariance, shared_errors
 
 # In codes: the noise is that of these with which two look-alikes are nearest to the picture; their mean is of more.
 NOISES, FIRST_NOISE = (0.0, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0), 3
@@ -39,6 +43,8 @@ MOST_FITS, ENOUGH_CHANGE, ENOUGH_NEARER = 8, 0.5, 2e-3
 APPROACH = 2.0
 # Of more pixels than this a part is fitted first, in rows of the blocks of colours; then all, so often.
 MANY, PART, BLOCK, MOST_WHOLE_FITS = 1 << 17, 4, 16, 2
+# How far numbers are moved at first, in standard errors; not along what leaves less than this share of their variances.
+FIRST_STEP, DEPENDENT = 2.0, 1e-9
 # Of a JPEG.
 LARGEST_CODE = 255.0
 
@@ -53,11 +59,9 @@ def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, O
     """The most likely fit to the pixels of a problem, less what compression does to look-alikes; and these pixels."""
     pictures, compressed = list(fit.pictures), list(map(_Compressed.of, observed.problem.targets))
     fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
-    if sum(len(one.shows) for one in compressed) > MANY and not any(picture.is_sampled for picture in pictures):
-        some = list(map(_part, pictures))
-        of_target = _parted(some, [one.shows for one in compressed])
-        parts = [dataclasses.replace(one, shows=one.shows[own]) for one, own in zip(compressed, of_target, strict=True)]
-        few = [picture.on_host(np.flatnonzero(own)) for picture, own in zip(pictures, some, strict=True)]
+    if _are_many(pictures) and not any(picture.is_sampled for picture in pictures):
+        some = [_rows(picture, PART) for picture in pictures]
+        few, parts = _of(some, pictures, compressed)
         fit = fit._replace(optimum=_nearest(fit._replace(pictures=few), parts, most, count).optimum)
         compressed = [
             dataclasses.replace(one, kind=part.kind, settled=True) for one, part in zip(compressed, parts, strict=True)
@@ -68,12 +72,103 @@ def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, O
     return fit, observed._replace(tiles=tiles)
 
 
-def _part(picture: Picture) -> Bool[np.ndarray, " P"]:
-    """Those whole rows of a picture, or of a band of it, that are nearest to the middle of the highlight."""
+def allowing_for_codec(fit: ModelFit, observed: Observed) -> ModelFit:
+    """A fit whose errors hold how far the numbers of a term may be off before what comes back of them shows it.
+
+    They are moved along the axes of their covariance, twice as far each time, until the estimate from what a codec
+    leaves of the picture moves by a standard error. Of a large picture some rows tell.
+    """
+    evidence, pictures, compressed = fit.evidence, fit.pictures, list(map(_Compressed.of, observed.problem.targets))
+    many = _are_many(pictures)
+    if evidence is None or (many and any(picture.is_sampled for picture in pictures)):
+        return fit  # lobes would be made anew for each of the pictures
+    at, working = evidence.optimum, evidence.pictures
+    alone, scatter = alone_covariance(at, fit.tied), shared_errors(evidence, observed)[0]
+    covariance = alone if scatter is None else alone + alone @ scatter @ alone
+    if many:
+        some = [_rows(picture, -(-sum(len(one.target) for one in pictures) // MANY)) for picture in pictures]
+        (working, _), (pictures, compressed) = _of(some, working, compressed), _of(some, pictures, compressed)
+    look_alikes, answer = LookAlikes(compressed, COMPARED), _answers(fit, pictures, working)
+
+    def come_back(x: Float[np.ndarray, "3 C"]) -> list[Float[np.ndarray, "P C"]]:
+        return look_alikes.come_back(pictures, [picture.predict(at.n, x) for picture in pictures])
+
+    still, moved = come_back(at.x), list(fit.moved)
+    for term, own in enumerate(np.arange(at.x.size).reshape(at.x.shape)):
+        error = np.sqrt(np.diag(covariance)[own])
+        known, axes = np.linalg.eigh(quotient(quotient(covariance[np.ix_(own, own)], error), error[:, None]))
+        for axis in (axes * np.sqrt(np.maximum(known, 0.0))).T[known > DEPENDENT]:
+            step, along = np.zeros_like(at.x), quotient(axis, error) / (axis @ axis)
+            step[term] = error * axis
+
+            def seen(times: float, step: np.ndarray = step, own: np.ndarray = own, along: np.ndarray = along) -> float:
+                back = come_back(np.maximum(at.x + times * step, 0.0))
+                return float(along @ answer(map(np.subtract, back, still))[own])
+
+            beyond = _reach(seen, float(np.max(at.x[term]) / np.max(np.abs(step)))) ** 2 - 1
+            if beyond > 0:
+                moved.append(np.append(math.sqrt(beyond) * step.ravel(), 0.0))
+    return fit._replace(moved=moved)
+
+
+def _reach(seen: Callable[[float], float], most: float) -> float:
+    """How far a number may be off, in standard errors, until that is seen as one of them."""
+    shorter, before, times, now = 0.0, 0.0, FIRST_STEP, seen(FIRST_STEP)
+    while now < 1 and times < most:
+        shorter, before, times, now = times, now, 2 * times, seen(2 * times)
+    return float(np.interp(1.0, [before, now], [shorter, times]))
+
+
+def _answers(
+    fit: ModelFit, pictures: Sequence[Picture], working: Sequence[Picture]
+) -> Callable[[Iterable[Float[np.ndarray, "P C"]]], Float[np.ndarray, " U"]]:
+    """How x_a, x_d, x_s, channel after channel, and n of a fit change with the codes of its pictures, to first order.
+
+    ``working`` are the same pixels with working weights.
+    """
+    evidence = fit.evidence
+    assert evidence is not None
+    at, channels = evidence.optimum, evidence.optimum.x.shape[1]
+    precision = np.eye(channels) / evidence.noise**2 if evidence.precision is None else evidence.precision
+    gram, parts = np.zeros((channels, channels, 4, 4)), []
+    for picture, weighed in zip(pictures, working, strict=True):
+        slope = bounds_of(picture).codes(np.asarray(picture.predict(at.n, at.x)))[1]
+        root = np.sqrt(np.asarray(weighed.weights) / np.diag(precision))
+        columns = weighed.columns(at.n) * root
+        gram += np.einsum("kpc,lpd->cdkl", columns, columns, optimize=True) * precision[..., None, None]
+        parts.append((columns, quotient(root, slope)))
+    basis = design_of(at.x > 0, fit.tied)
+    none = np.zeros((channels, 4))
+    inverse = inverse_among(join_channels(gram, none, none[:, 0], at.x[2]).gram, basis)
+
+    def answer(of_codes: Iterable[Float[np.ndarray, "P C"]]) -> Float[np.ndarray, " U"]:
+        product = np.zeros((channels, 4))
+        for (columns, unit), moved in zip(parts, of_codes, strict=True):
+            product += np.einsum("kpc,pc->ck", columns, (moved * unit) @ precision)
+        return inverse @ join_channels(gram, product, none[:, 0], at.x[2]).product
+
+    return answer
+
+
+def _are_many(pictures: Sequence[Picture]) -> bool:
+    return sum(len(picture.target) for picture in pictures) > MANY
+
+
+def _rows(picture: Picture, parts: int) -> Bool[np.ndarray, " P"]:
+    """Those whole rows of a picture, or of a band of it, one of so many parts, that are nearest to the highlight."""
     width, count = int(bounds_of(picture).width), len(picture.target)
-    size = min(width * max(BLOCK, count // width // PART // BLOCK * BLOCK), count)
+    size = min(width * max(BLOCK, count // width // parts // BLOCK * BLOCK), count)
     middle = 0 if picture.lobe is None else int(np.argmax(picture.lobe.peak))
     return np.arange(count) // size == min(middle // size, count // size - 1)
+
+
+def _of(
+    some: Sequence[Bool[np.ndarray, " P"]], pictures: Sequence[Picture], compressed: Sequence["_Compressed"]
+) -> tuple[list[Picture], list["_Compressed"]]:
+    """Some pixels of pictures, or of their bands, and of what was compressed."""
+    of_target = _parted(some, [one.shows for one in compressed])
+    parts = [dataclasses.replace(one, shows=one.shows[own]) for one, own in zip(compressed, of_target, strict=True)]
+    return [picture.on_host(np.flatnonzero(own)) for picture, own in zip(pictures, some, strict=True)], parts
 
 
 def _parted(parts: Sequence[np.ndarray], like: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -124,16 +219,28 @@ class LookAlikes:
 
     def are_nearer(self, pictures: Sequence[Any], radiance: Sequence[Float[np.ndarray, "P C"]]) -> bool:
         """Whether a prediction's look-alikes are nearer to the pictures than the last ones: then they are the ones."""
-        shown = list(map(_in_codes, map(bounds_of, pictures), radiance))
-        whole = _parted(shown, [one.shows for one in self._compressed])
-        both = zip(self._compressed, whole, strict=True)
-        errors, squares = zip(*(one.errors(some, self._count) for one, some in both), strict=True)
-        left = math.fsum(squares)
+        shown, errors, left = self._through(pictures, radiance)
         if left > self.left:
             return False
         self.enough, self.left = self.left - left < ENOUGH_NEARER * left, left
-        self.widening, self._parts = math.sqrt(1 + 1 / self._count), (shown, _parted(errors, shown))
+        self.widening, self._parts = math.sqrt(1 + 1 / self._count), (shown, errors)
         return True
+
+    def come_back(
+        self, pictures: Sequence[Any], radiance: Sequence[Float[np.ndarray, "P C"]]
+    ) -> list[Float[np.ndarray, "P C"]]:
+        """What comes back of predictions, in codes, with the noise of the first; 0 of a value that says nothing."""
+        shown, errors, _ = self._through(pictures, radiance)
+        for one in self._compressed:
+            one.settled = True
+        return list(map(np.add, map(np.nan_to_num, shown), errors))
+
+    def _through(self, pictures: Sequence[Any], radiance: Sequence[Float[np.ndarray, "P C"]]) -> tuple[Any, Any, float]:
+        """What is predicted, in codes; what compression does to it; and squares of what else the pictures show."""
+        shown = list(map(_in_codes, map(bounds_of, pictures), radiance))
+        both = zip(self._compressed, _parted(shown, [one.shows for one in self._compressed]), strict=True)
+        errors, squares = zip(*(one.errors(some, self._count) for one, some in both), strict=True)
+        return shown, _parted(errors, shown), math.fsum(squares)
 
     def taken_off(self, pictures: Sequence[Any]) -> Sequence[Any]:
         """The pictures less what compression does to them."""
