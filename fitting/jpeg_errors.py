@@ -26,12 +26,11 @@ from fitting.maximum_likelihood import bounds_of, change, most_likely
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed
 from fitting.problem import Target
+from fitting.solver.nnls import scaled_inverse
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit
 from fitting.solver.streams import each
 from fitting.solver.tied import design_of, join_channels
-from fitting.uncertainty.covariance import inverse_among
-from fitting.uncertainty.interpretation import alone_covariance, shared_errors
 
 # In codes: the noise is that of these with which two look-alikes are nearest to the picture; their mean is of more.
 NOISES, FIRST_NOISE = (0.0, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0), 3
@@ -44,7 +43,7 @@ APPROACH = 2.0
 # Of more pixels than this a part is fitted first, in rows of the blocks of colours; then all, so often.
 MANY, PART, BLOCK, MOST_WHOLE_FITS = 1 << 17, 4, 16, 2
 # How far numbers are moved at first, in standard errors; not along what leaves less than this share of their variances.
-FIRST_STEP, DEPENDENT = 2.0, 1e-9
+FIRST_STEP, DEPENDENT, LEAST_KNOWN = 2.0, 1e-9, 1e-14
 # Of a JPEG.
 LARGEST_CODE = 255.0
 
@@ -72,7 +71,7 @@ def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, O
     return fit, observed._replace(tiles=tiles)
 
 
-def allowing_for_codec(fit: ModelFit, observed: Observed) -> ModelFit:
+def allowing_for_codec(fit: ModelFit, observed: Observed, covariance: Float[np.ndarray, "U U"]) -> ModelFit:
     """A fit whose errors hold how far the numbers of a term may be off before what comes back of them shows it.
 
     They are moved along the axes of their covariance, twice as far each time, until the estimate from what a codec
@@ -83,8 +82,6 @@ def allowing_for_codec(fit: ModelFit, observed: Observed) -> ModelFit:
     if evidence is None or (many and any(picture.is_sampled for picture in pictures)):
         return fit  # lobes would be made anew for each of the pictures
     at, working = evidence.optimum, evidence.pictures
-    alone, scatter = alone_covariance(at, fit.tied), shared_errors(evidence, observed)[0]
-    covariance = alone if scatter is None else alone + alone @ scatter @ alone
     if many:
         some = [_rows(picture, -(-sum(len(one.target) for one in pictures) // MANY)) for picture in pictures]
         (working, _), (pictures, compressed) = _of(some, working, compressed), _of(some, pictures, compressed)
@@ -139,7 +136,8 @@ def _answers(
         parts.append((columns, quotient(root, slope)))
     basis = design_of(at.x > 0, fit.tied)
     none = np.zeros((channels, 4))
-    inverse = inverse_among(join_channels(gram, none, none[:, 0], at.x[2]).gram, basis)
+    whole = join_channels(gram, none, none[:, 0], at.x[2]).gram
+    inverse = basis @ scaled_inverse(basis.T @ whole @ basis, LEAST_KNOWN) @ basis.T
 
     def answer(of_codes: Iterable[Float[np.ndarray, "P C"]]) -> Float[np.ndarray, " U"]:
         product = np.zeros((channels, 4))

@@ -151,6 +151,16 @@ def test_errors_hold_what_the_codec_hides(tmp_path):
     assert np.sqrt(np.mean(np.square(off))) < 2  # 7 before
 
 
+def test_a_highlight_that_a_codec_made_is_none(tmp_path):
+    """What was chosen before its errors were taken off left n open and k_s at its error, and was called phong."""
+    one, kept = ball(70030, model="lambert", channels=3), dataclasses.replace(COLOUR, quality=75)
+    result = fitting.fit(kept.picture(one.drawn(), 70030, tmp_path), one.scene())
+    (chosen,) = (candidate for candidate in result.candidates if candidate.chosen)
+    assert (result.surface, chosen.name) == ("lambert", "lambert with ambient")
+    off = [(own.value - true) / own.error for own, true in zip(result["k_d"], one.k[1], strict=True)]
+    assert np.max(np.abs(off)) < 3
+
+
 @pytest.mark.parametrize("lost", ["taken out", "clipped in one channel"])
 def test_values_that_are_no_numbers_are_no_codes(tmp_path, lost):
     one = ball(3, channels=3, size=64)
