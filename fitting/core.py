@@ -16,7 +16,6 @@ import brdf
 from brdf.channels import channel_names
 from brdf.errors import InputError
 from brdf.lobes import Near
-from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from fitting.doubts import doubts
 from fitting.growing_noise import Shown, as_it_grows, likeliest
@@ -38,8 +37,8 @@ from fitting.solver.refinement import TOLERANCE_DOUBLE
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels, places_of
 from fitting.tile import picture_of
-from fitting.uncertainty.covariance import LOST_IN_NOISE, NO_TRACE, residual_noise, specular_gain
-from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
+from fitting.uncertainty.covariance import NO_TRACE, inverse_among, residual_noise, specular_gain
+from fitting.uncertainty.interpretation import interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual import SOME_PIXELS, Residual, residual_statistics, variance_inflation
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
@@ -87,36 +86,25 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         if fit.capped or problem.loss != "squared":
             statistics = None
         result, optimum = _interpreted(fit, observed, choice, statistics=statistics), fit.optimum
-        hidden, may_be_matt = _hidden(result) if issubclass(fit.model, SpecularMaterial) else ("", False)
-        may_be_matt &= choice is not None
+        # Why there is a highlight in the numbers but none in the material.
+        reasons = {one.reason for one in result.parameters if one.name in ("k_s", "n")}
+        hidden = reasons.pop() if len(reasons) == 1 else ""
         widest = optimum.n <= WIDEST * problem.n_range[0]
         if widest and not hidden and highlight_in_codes(fit.pictures, optimum) < 1.0:
             hidden = ROUNDED_AWAY
-        if (hidden or may_be_matt) and not fit.capped and optimum.x[2].any():
+        if hidden and not fit.capped and optimum.x[2].any():
             # Or ambient and diffuse would be the ones that go with the highlight. Weights of a robust loss are made
             # anew.
             free = fit.free & [[True], [True], [False]]
             pictures = fit.pictures if problem.loss == "squared" else None
-            model = fit.model
-            if may_be_matt and choice is not None:
-                model, choice = brdf.Lambert, choice.matt(free)
-            rest = _held_plausible(most_likely(_fit_model(model, observed, free, pictures)), observed)
-            without = np.append((rest.optimum.x > 0).ravel(), 0.0)
-            fit = rest._replace(moved=[*(one * without for one in fit.moved), _by_highlight(fit, rest, observed)])
+            rest = _held_plausible(most_likely(_fit_model(fit.model, observed, free, pictures)), observed)
+            fit = rest._replace(moved=(_by_highlight(fit, rest, observed),))
             result = _interpreted(fit, observed, choice, hidden)
     if grown is not even:
         # Of the picture as it is, not as noise weighs it.
         result = dataclasses.replace(result, residual=even[0].residual)
     candidates = () if choice is None else choice.candidates
     return dataclasses.replace(result, candidates=candidates, optimum=optimum)
-
-
-def _hidden(result: FitResult) -> tuple[str, bool]:
-    """Why there is a highlight in the numbers but none in the material, if so, and whether there may be none at all."""
-    *k_s, n = (one for one in result.parameters if one.name in ("k_s", "n"))
-    reasons = {one.reason for one in (*k_s, n)}
-    open_ = n.value is None and all(one.interval is not None and one.interval[0] <= 0 for one in k_s)
-    return (n.reason, n.reason == LOST_IN_NOISE) if len(reasons) == 1 else ("", open_)
 
 
 def predictions(problem: FitProblem) -> tuple[list[Float[np.ndarray, "H W C"]], list[Bool[np.ndarray, "H W"]]]:
@@ -419,7 +407,8 @@ def _less_codec_errors(
         value = [sum(_value(one, clean) for _, clean in found) for one in fits]
         best, clean = found[int(np.argmax(value))]
         if _coloured(best, clean):
-            return _allowing_for_codec(best, clean), choice.coloured(best.model.name, best.free), clean
+            best = _allowing_for_codec(best, clean) if known else best
+            return best, choice.coloured(best.model.name, best.free), clean
     if known:
         fit, observed = without_codec_errors(observed, fit)
         fit = _allowing_for_codec(fit, observed)
@@ -429,15 +418,15 @@ def _less_codec_errors(
 
 
 def _allowing_for_codec(fit: ModelFit, observed: Observed) -> ModelFit:
-    return (
-        fit if fit.evidence is None else allowing_for_codec(fit, observed, np.sum(_covariances(fit, observed), axis=0))
-    )
+    """With errors that hold what the codec hides; in units of both covariances: of few blocks one says too little."""
+    return fit if fit.evidence is None else allowing_for_codec(fit, observed, np.add(*_covariances(fit, observed)))
 
 
 def _covariances(fit: ModelFit, observed: Observed) -> tuple[Float[np.ndarray, "U U"], Float[np.ndarray, "U U"]]:
     """Those of a fit's numbers by what rounded values say, if pixels erred alone and as they do."""
     assert fit.evidence is not None
-    alone, scatter = alone_covariance(fit.evidence.optimum, fit.tied), shared_errors(fit.evidence, observed)[0]
+    alone = inverse_among(fit.evidence.normal.gram, design_of(fit.evidence.optimum.x > 0, fit.tied))
+    scatter = shared_errors(fit.evidence, observed)[0]
     return alone, alone if scatter is None else alone @ scatter @ alone
 
 

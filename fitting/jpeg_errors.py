@@ -12,11 +12,11 @@ D. McFadden, "A method of simulated moments", Econometrica 57 (1989) 995.
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from brdf.images.encoding import decode
 from brdf.images.jpeg import Jpeg
@@ -30,7 +30,7 @@ from fitting.solver.nnls import scaled_inverse
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit
 from fitting.solver.streams import each
-from fitting.solver.tied import design_of, join_channels
+from fitting.solver.tied import NormalEquations, design_of, join_channels
 
 # In codes: the noise is that of these with which two look-alikes are nearest to the picture; their mean is of more.
 NOISES, FIRST_NOISE = (0.0, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0), 3
@@ -42,7 +42,8 @@ MOST_FITS, ENOUGH_CHANGE, ENOUGH_NEARER = 8, 0.5, 2e-3
 APPROACH = 2.0
 # Of more pixels than this a part is fitted first, in rows of the blocks of colours; then all, so often.
 MANY, PART, BLOCK, MOST_WHOLE_FITS = 1 << 17, 4, 16, 2
-# How far numbers are moved at first, in standard errors; not along what leaves less than this share of their variances.
+# How far numbers are moved at first, in standard errors; not along axes of less than this share of their variances. A
+# direction of which pixels tell less than this share of the others is told by none.
 FIRST_STEP, DEPENDENT, LEAST_KNOWN = 2.0, 1e-9, 1e-14
 # Of a JPEG.
 LARGEST_CODE = 255.0
@@ -60,7 +61,7 @@ def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, O
     fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
     if _are_many(pictures) and not any(picture.is_sampled for picture in pictures):
         some = [_rows(picture, PART) for picture in pictures]
-        few, parts = _of(some, pictures, compressed)
+        few, parts = _subset(some, pictures, compressed)
         fit = fit._replace(optimum=_nearest(fit._replace(pictures=few), parts, most, count).optimum)
         compressed = [
             dataclasses.replace(one, kind=part.kind, settled=True) for one, part in zip(compressed, parts, strict=True)
@@ -72,80 +73,115 @@ def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, O
 
 
 def allowing_for_codec(fit: ModelFit, observed: Observed, covariance: Float[np.ndarray, "U U"]) -> ModelFit:
-    """A fit whose errors hold how far the numbers of a term may be off before what comes back of them shows it.
+    """A fit whose errors hold by how much its coefficients may be off before what the codec leaves shows it.
 
-    They are moved along the axes of their covariance, twice as far each time, until the estimate from what a codec
-    leaves of the picture moves by a standard error. Of a large picture some rows tell.
+    Those of a term are moved along the axes of their covariance, both ways and twice as far each time, until the
+    estimate from what comes back of such a picture moves by a standard error. Of a large picture the rows about the
+    highlight tell; of one whose lobes are made anew at each evaluation, and which would take too long, nothing is told.
     """
     evidence, pictures, compressed = fit.evidence, fit.pictures, list(map(_Compressed.of, observed.problem.targets))
     many = _are_many(pictures)
     if evidence is None or (many and any(picture.is_sampled for picture in pictures)):
-        return fit  # lobes would be made anew for each of the pictures
-    at, working = evidence.optimum, evidence.pictures
+        return fit
+    x, working, moved = evidence.optimum.x, evidence.pictures, list(fit.moved)
     if many:
-        some = [_rows(picture, -(-sum(len(one.target) for one in pictures) // MANY)) for picture in pictures]
-        (working, _), (pictures, compressed) = _of(some, working, compressed), _of(some, pictures, compressed)
-    look_alikes, answer = LookAlikes(compressed, COMPARED), _answers(fit, pictures, working)
+        some = _about_highlights(pictures, fit.owner)
+        (working, _), (pictures, compressed) = _subset(some, working, compressed), _subset(some, pictures, compressed)
+    response = _Response(fit, pictures, working, LookAlikes(compressed, COMPARED))
+    for term in np.arange(x.size).reshape(x.shape):
+        for axis, part in _axes(covariance, term):
+            distances = []
+            for step in (axis, -axis):
+                bounds = quotient(x.ravel()[term], np.maximum(-step[term], 0.0))
+                most = min([np.max(x.ravel()[term]) / np.max(np.abs(step)), *bounds[step[term] < 0]])
 
-    def come_back(x: Float[np.ndarray, "3 C"]) -> list[Float[np.ndarray, "P C"]]:
-        return look_alikes.come_back(pictures, [picture.predict(at.n, x) for picture in pictures])
+                def seen(times: float, step: np.ndarray = step, part: np.ndarray = part) -> float:
+                    return float(np.sign(step @ part) * part @ response(times * step))
 
-    still, moved = come_back(at.x), list(fit.moved)
-    for term, own in enumerate(np.arange(at.x.size).reshape(at.x.shape)):
-        error = np.sqrt(np.diag(covariance)[own])
-        known, axes = np.linalg.eigh(quotient(quotient(covariance[np.ix_(own, own)], error), error[:, None]))
-        for axis in (axes * np.sqrt(np.maximum(known, 0.0))).T[known > DEPENDENT]:
-            step, along = np.zeros_like(at.x), quotient(axis, error) / (axis @ axis)
-            step[term] = error * axis
-
-            def seen(times: float, step: np.ndarray = step, own: np.ndarray = own, along: np.ndarray = along) -> float:
-                back = come_back(np.maximum(at.x + times * step, 0.0))
-                return float(along @ answer(map(np.subtract, back, still))[own])
-
-            beyond = _reach(seen, float(np.max(at.x[term]) / np.max(np.abs(step)))) ** 2 - 1
+                distances.append(_detection_distance(seen, most))
+            beyond = (0.5 * sum(distances)) ** 2 - 1
             if beyond > 0:
-                moved.append(np.append(math.sqrt(beyond) * step.ravel(), 0.0))
+                moved.append(math.sqrt(beyond) * axis)
     return fit._replace(moved=moved)
 
 
-def _reach(seen: Callable[[float], float], most: float) -> float:
-    """How far a number may be off, in standard errors, until that is seen as one of them."""
-    shorter, before, times, now = 0.0, 0.0, FIRST_STEP, seen(FIRST_STEP)
-    while now < 1 and times < most:
-        shorter, before, times, now = times, now, 2 * times, seen(2 * times)
+def _axes(
+    covariance: Float[np.ndarray, "U U"], own: Int[np.ndarray, " K"]
+) -> Iterator[tuple[Float[np.ndarray, " U"], Float[np.ndarray, " U"]]]:
+    """The axes of the covariance of some unknowns, a standard error long each, and what of a change is along them."""
+    error = np.sqrt(np.diag(covariance)[own])
+    variances, axes = np.linalg.eigh(quotient(quotient(covariance[np.ix_(own, own)], error), error[:, None]))
+    for variance, axis in zip(variances, axes.T, strict=True):
+        if variance > DEPENDENT:
+            step, part = np.zeros((2, len(covariance)))
+            step[own], part[own] = error * axis * math.sqrt(variance), quotient(axis, error) / math.sqrt(variance)
+            yield step, part
+
+
+def _detection_distance(seen: Callable[[float], float], most: float) -> float:
+    """How far, in standard errors and at most, a number has to be off until that is seen as one of them."""
+    shorter, before, times = 0.0, 0.0, min(FIRST_STEP, most)
+    while (now := seen(times)) < 1:
+        if times == most:
+            return most
+        shorter, before, times = times, now, min(2 * times, most)
     return float(np.interp(1.0, [before, now], [shorter, times]))
 
 
-def _answers(
-    fit: ModelFit, pictures: Sequence[Picture], working: Sequence[Picture]
-) -> Callable[[Iterable[Float[np.ndarray, "P C"]]], Float[np.ndarray, " U"]]:
-    """How x_a, x_d, x_s, channel after channel, and n of a fit change with the codes of its pictures, to first order.
+class _Response:
+    """How the estimate changes, to first order, when coefficients do and the picture comes back from its codec.
 
-    ``working`` are the same pixels with working weights.
+    Over x_a, x_d, x_s, channel after channel, and n.
     """
-    evidence = fit.evidence
-    assert evidence is not None
-    at, channels = evidence.optimum, evidence.optimum.x.shape[1]
-    precision = np.eye(channels) / evidence.noise**2 if evidence.precision is None else evidence.precision
-    gram, parts = np.zeros((channels, channels, 4, 4)), []
-    for picture, weighed in zip(pictures, working, strict=True):
-        slope = bounds_of(picture).codes(np.asarray(picture.predict(at.n, at.x)))[1]
-        root = np.sqrt(np.asarray(weighed.weights) / np.diag(precision))
-        columns = weighed.columns(at.n) * root
-        gram += np.einsum("kpc,lpd->cdkl", columns, columns, optimize=True) * precision[..., None, None]
-        parts.append((columns, quotient(root, slope)))
-    basis = design_of(at.x > 0, fit.tied)
-    none = np.zeros((channels, 4))
-    whole = join_channels(gram, none, none[:, 0], at.x[2]).gram
-    inverse = basis @ scaled_inverse(basis.T @ whole @ basis, LEAST_KNOWN) @ basis.T
 
-    def answer(of_codes: Iterable[Float[np.ndarray, "P C"]]) -> Float[np.ndarray, " U"]:
-        product = np.zeros((channels, 4))
-        for (columns, unit), moved in zip(parts, of_codes, strict=True):
-            product += np.einsum("kpc,pc->ck", columns, (moved * unit) @ precision)
-        return inverse @ join_channels(gram, product, none[:, 0], at.x[2]).product
+    def __init__(
+        self, fit: ModelFit, pictures: Sequence[Picture], working: Sequence[Picture], look_alikes: "LookAlikes"
+    ):
+        """Of the pictures of a fit, or of some of their pixels, and the same with working weights."""
+        evidence = fit.evidence
+        assert evidence is not None
+        at, channels = evidence.optimum, evidence.optimum.x.shape[1]
+        self._at, self._pictures, self._look_alikes = at, pictures, look_alikes
+        self._precision = np.eye(channels) / evidence.noise**2 if evidence.precision is None else evidence.precision
+        # Columns in units of the noise, and what makes codes such.
+        self._columns, self._units, gram = [], [], np.zeros((channels, channels, 4, 4))
+        for picture, weighed in zip(pictures, working, strict=True):
+            slope = bounds_of(picture).codes(np.asarray(picture.predict(at.n, at.x)))[1]
+            root = np.sqrt(np.asarray(weighed.weights) / np.diag(self._precision))
+            columns = weighed.columns(at.n) * root
+            gram += np.einsum("kpc,lpd->cdkl", columns, columns, optimize=True) * self._precision[..., None, None]
+            self._columns.append(columns)
+            self._units.append(quotient(root, slope))
+        self._gram, basis = gram, design_of(at.x > 0, fit.tied)
+        hessian = self._joined(np.zeros((channels, 4))).gram
+        self._inverse = basis @ scaled_inverse(basis.T @ hessian @ basis, LEAST_KNOWN) @ basis.T
+        self._still = self._comes_back(at.x)
 
-    return answer
+    def __call__(self, step: Float[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
+        """The change of the estimate when coefficients change by so much."""
+        product = np.zeros((len(self._precision), 4))
+        back = self._comes_back(np.maximum(self._at.x + step[:-1].reshape(self._at.x.shape), 0.0))
+        for columns, unit, now, still in zip(self._columns, self._units, back, self._still, strict=True):
+            product += np.einsum("kpc,pc->ck", columns, (now - still) * unit @ self._precision)
+        return self._inverse @ self._joined(product).product
+
+    def _comes_back(self, x: Float[np.ndarray, "3 C"]) -> list[Float[np.ndarray, "P C"]]:
+        return self._look_alikes.come_back(self._pictures, [one.predict(self._at.n, x) for one in self._pictures])
+
+    def _joined(self, product: Float[np.ndarray, "C 4"]) -> NormalEquations:
+        return join_channels(self._gram, product, product[:, 0], self._at.x[2])
+
+
+def _about_highlights(pictures: Sequence[Picture], owner: Sequence[int]) -> list[Bool[np.ndarray, " P"]]:
+    """Of each picture, which may be in bands, about as many pixels as tell, in whole rows: where the highlight is."""
+    peaks = [-np.inf if one.lobe is None else float(np.max(one.lobe.peak)) for one in pictures]
+    brightest = {one: max((peaks[i], -i) for i in np.flatnonzero(np.equal(owner, one)))[1] for one in owner}
+    some = []
+    for index, picture in enumerate(pictures):
+        parts = -(-len(picture.target) * len(brightest) // MANY)
+        chosen = -brightest[owner[index]] == index
+        some.append(_rows(picture, parts) if chosen else np.zeros(len(picture.target), bool))
+    return some
 
 
 def _are_many(pictures: Sequence[Picture]) -> bool:
@@ -160,13 +196,13 @@ def _rows(picture: Picture, parts: int) -> Bool[np.ndarray, " P"]:
     return np.arange(count) // size == min(middle // size, count // size - 1)
 
 
-def _of(
+def _subset(
     some: Sequence[Bool[np.ndarray, " P"]], pictures: Sequence[Picture], compressed: Sequence["_Compressed"]
 ) -> tuple[list[Picture], list["_Compressed"]]:
-    """Some pixels of pictures, or of their bands, and of what was compressed."""
+    """Some pixels of pictures, or of their bands but for those that have none, and of what was compressed."""
     of_target = _parted(some, [one.shows for one in compressed])
     parts = [dataclasses.replace(one, shows=one.shows[own]) for one, own in zip(compressed, of_target, strict=True)]
-    return [picture.on_host(np.flatnonzero(own)) for picture, own in zip(pictures, some, strict=True)], parts
+    return [one.on_host(np.flatnonzero(own)) for one, own in zip(pictures, some, strict=True) if own.any()], parts
 
 
 def _parted(parts: Sequence[np.ndarray], like: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -92,18 +92,11 @@ class Choice(NamedTuple):
 
     def coloured(self, model: str, free: Bool[np.ndarray, "3 C"]) -> "Choice":
         """The same terms with a coloured highlight."""
-        rivals = tuple(sorted({self.model, *self.rivals} - {model})) if self.rivals else ()
-        return self._instead(model, free, "coloured", rivals)
-
-    def matt(self, free: Bool[np.ndarray, "3 C"]) -> "Choice":
-        """The same terms without a highlight."""
-        return self._instead("lambert", free, "", ())
-
-    def _instead(self, model: str, free: Bool[np.ndarray, "3 C"], highlight: str, rivals: tuple[str, ...]) -> "Choice":
-        wanted = model, bool(free[0].any()), highlight
+        wanted = model, bool(free[0].any()), "coloured"
         candidates = tuple(
             replace(one, chosen=(one.model, one.ambient, one.highlight) == wanted) for one in self.candidates
         )
+        rivals = tuple(sorted({self.model, *self.rivals} - {model})) if self.rivals else ()
         return Choice(candidates, model, free, False, rivals, np.zeros_like(self.dropped))
 
 

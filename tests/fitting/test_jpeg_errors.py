@@ -138,6 +138,38 @@ def test_look_alikes_of_a_large_picture_come_nearer_until_errors_are_true(tmp_pa
     assert not any("structure" in words for words in result.warnings)
 
 
+@pytest.mark.parametrize(
+    ("seen", "most", "distance"),
+    [
+        (lambda times: 1.25 * times, 99.0, 0.8),
+        (lambda times: 0.1 * times, 99.0, 10.0),
+        (lambda times: 0.0 if times < 5 else times, 99.0, 4.5),  # first seen at 8, and not at 4
+        (lambda times: 0.0, 9.0, 9.0),
+        (lambda times: 0.1 * times, 0.5, 0.5),
+    ],
+)
+def test_how_far_off_a_number_has_to_be_until_it_is_seen(seen, most, distance):
+    assert jpeg_errors._detection_distance(seen, most) == pytest.approx(distance)
+
+
+@pytest.mark.parametrize(("k_s", "model"), [(None, "named"), (0.03, "auto")])
+def test_what_comes_back_as_it_went_in_hides_nothing(tmp_path, monkeypatch, k_s, model):
+    seen = []
+
+    def allowing(fit, observed, covariance):
+        after = jpeg_errors.allowing_for_codec(fit, observed, covariance)
+        seen.append((fit, np.sqrt(np.diag(covariance)), after.moved[len(fit.moved) :]))
+        return after
+
+    monkeypatch.setattr(core, "allowing_for_codec", allowing)
+    monkeypatch.setattr(jpeg_errors._Compressed, "_look_alikes", lambda self, clean, *_: (np.zeros_like(clean), 1.0))
+    one = ball(3, channels=3, k_s=k_s)
+    fitting.fit(COLOUR.picture(one.drawn(), 3, tmp_path), one.scene(), model=one.model if model == "named" else model)
+    ((fit, error, moved),) = seen
+    assert (fit.tied is None) == (model == "named")
+    assert np.all(np.abs(moved) <= 0.3 * error)
+
+
 def test_errors_hold_what_the_codec_hides(tmp_path):
     """A codec leaves no colour of a small highlight: k_s was up to 27 of its errors off."""
     off = []
@@ -149,16 +181,6 @@ def test_errors_hold_what_the_codec_hides(tmp_path):
         for name, truth in zip(("k_a", "k_d", "k_s"), one.k, strict=True):
             off += [(own.value - true) / own.error for own, true in zip(result[name], truth, strict=True)]
     assert np.sqrt(np.mean(np.square(off))) < 2  # 7 before
-
-
-def test_a_highlight_that_a_codec_made_is_none(tmp_path):
-    """What was chosen before its errors were taken off left n open and k_s at its error, and was called phong."""
-    one, kept = ball(70030, model="lambert", channels=3), dataclasses.replace(COLOUR, quality=75)
-    result = fitting.fit(kept.picture(one.drawn(), 70030, tmp_path), one.scene())
-    (chosen,) = (candidate for candidate in result.candidates if candidate.chosen)
-    assert (result.surface, chosen.name) == ("lambert", "lambert with ambient")
-    off = [(own.value - true) / own.error for own, true in zip(result["k_d"], one.k[1], strict=True)]
-    assert np.max(np.abs(off)) < 3
 
 
 @pytest.mark.parametrize("lost", ["taken out", "clipped in one channel"])
