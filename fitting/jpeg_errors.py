@@ -42,6 +42,8 @@ MOST_FITS, ENOUGH_CHANGE, ENOUGH_NEARER = 8, 0.5, 2e-3
 APPROACH = 2.0
 # Of more pixels than this a part is fitted first, in rows of the blocks of colours; then all, so often.
 MANY, PART, BLOCK, MOST_WHOLE_FITS = 1 << 17, 4, 16, 2
+# Of so many pixels, in rows about the highlights, it is asked what a codec hides.
+TELLING = 1 << 16
 # How far numbers are moved at first, in standard errors; not along axes of less than this share of their variances. A
 # direction of which pixels tell less than this share of the others is told by none.
 FIRST_STEP, DEPENDENT, LEAST_KNOWN = 2.0, 1e-9, 1e-14
@@ -59,7 +61,7 @@ def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, O
     """The most likely fit to the pixels of a problem, less what compression does to look-alikes; and these pixels."""
     pictures, compressed = list(fit.pictures), list(map(_Compressed.of, observed.problem.targets))
     fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
-    if _are_many(pictures) and not any(picture.is_sampled for picture in pictures):
+    if _pixels(pictures) > MANY and not any(picture.is_sampled for picture in pictures):
         some = [_rows(picture, PART) for picture in pictures]
         few, parts = _subset(some, pictures, compressed)
         fit = fit._replace(optimum=_nearest(fit._replace(pictures=few), parts, most, count).optimum)
@@ -80,7 +82,7 @@ def allowing_for_codec(fit: ModelFit, observed: Observed, covariance: Float[np.n
     highlight tell; of one whose lobes are made anew at each evaluation, and which would take too long, nothing is told.
     """
     evidence, pictures, compressed = fit.evidence, fit.pictures, list(map(_Compressed.of, observed.problem.targets))
-    many = _are_many(pictures)
+    many = _pixels(pictures) > TELLING
     if evidence is None or (many and any(picture.is_sampled for picture in pictures)):
         return fit
     x, working, moved = evidence.optimum.x, evidence.pictures, list(fit.moved)
@@ -90,19 +92,21 @@ def allowing_for_codec(fit: ModelFit, observed: Observed, covariance: Float[np.n
     response = _Response(fit, pictures, working, LookAlikes(compressed, COMPARED))
     for term in np.arange(x.size).reshape(x.shape):
         for axis, part in _axes(covariance, term):
-            distances = []
-            for step in (axis, -axis):
-                bounds = quotient(x.ravel()[term], np.maximum(-step[term], 0.0))
-                most = min([np.max(x.ravel()[term]) / np.max(np.abs(step)), *bounds[step[term] < 0]])
-
-                def seen(times: float, step: np.ndarray = step, part: np.ndarray = part) -> float:
-                    return float(np.sign(step @ part) * part @ response(times * step))
-
-                distances.append(_detection_distance(seen, most))
-            beyond = (0.5 * sum(distances)) ** 2 - 1
+            both = [_hidden(response, x, sign * axis, sign * part) for sign in (1.0, -1.0)]
+            beyond = float(np.mean(both)) ** 2 - 1
             if beyond > 0:
                 moved.append(math.sqrt(beyond) * axis)
     return fit._replace(moved=moved)
+
+
+def _hidden(
+    response: "_Response", x: Float[np.ndarray, "3 C"], step: Float[np.ndarray, " U"], part: Float[np.ndarray, " U"]
+) -> float:
+    """How many steps coefficients may be off until the estimate is by one: no farther than the first is 0, or twice."""
+    at, size = x.ravel(), step[:-1]
+    most = np.max(at[size != 0]) / np.max(np.abs(size))
+    most = min(most, np.min(at[size < 0] / -size[size < 0], initial=np.inf))
+    return _detection_distance(lambda times: float(part @ response(times * step)), float(most))
 
 
 def _axes(
@@ -178,14 +182,14 @@ def _about_highlights(pictures: Sequence[Picture], owner: Sequence[int]) -> list
     brightest = {one: max((peaks[i], -i) for i in np.flatnonzero(np.equal(owner, one)))[1] for one in owner}
     some = []
     for index, picture in enumerate(pictures):
-        parts = -(-len(picture.target) * len(brightest) // MANY)
+        parts = -(-len(picture.target) * len(brightest) // TELLING)
         chosen = -brightest[owner[index]] == index
         some.append(_rows(picture, parts) if chosen else np.zeros(len(picture.target), bool))
     return some
 
 
-def _are_many(pictures: Sequence[Picture]) -> bool:
-    return sum(len(picture.target) for picture in pictures) > MANY
+def _pixels(pictures: Sequence[Picture]) -> int:
+    return sum(len(picture.target) for picture in pictures)
 
 
 def _rows(picture: Picture, parts: int) -> Bool[np.ndarray, " P"]:
@@ -302,6 +306,7 @@ class _Compressed:
         unit: codes of a JPEG for one of the file's.
         kind: which of `NOISES` it has.
         settled: no other is tried.
+        drawn: noise of deviation 1 of each look-alike, the same each time.
     """
 
     codec: Jpeg | None
@@ -310,6 +315,7 @@ class _Compressed:
     unit: float
     kind: int = FIRST_NOISE
     settled: bool = False
+    drawn: list[Float[np.ndarray, "P C"]] = dataclasses.field(default_factory=list, init=False)
 
     @classmethod
     def of(cls, target: Target) -> "_Compressed":
@@ -344,10 +350,9 @@ class _Compressed:
     ) -> tuple[Float[np.ndarray, "P C"], float]:
         """Their mean change, and the squares of what the picture differs by from the mean of all there could be."""
         assert self.codec is not None
-        random, shape = np.random.default_rng(0), (-1, self.width, clean.shape[1])
-        mean, off, squares = np.zeros_like(clean), np.zeros_like(clean), 0.0
-        for _ in range(count):
-            before = clean + counts * random.standard_normal(clean.shape, np.float32) * np.float32(noise)
+        shape, mean, off, squares = (-1, self.width, clean.shape[1]), np.zeros_like(clean), np.zeros_like(clean), 0.0
+        for index in range(count):
+            before = clean + counts * self._noise(index) * np.float32(noise)
             given = np.clip(np.rint(before), 0, LARGEST_CODE).astype(np.uint8)
             after = self.codec.through(given.reshape(shape)).reshape(clean.shape).astype(np.float32)
             mean += (after - before) / np.float32(count)
@@ -356,6 +361,15 @@ class _Compressed:
         # Each look-alike has errors of its own: the product of two differences has neither's in the mean.
         together = float(np.sum(np.where(counts, off, 0) ** 2, dtype=float))
         return np.where(counts, mean, np.float32(0)), (together - squares) / (count * (count - 1))
+
+    def _noise(self, index: int) -> Float[np.ndarray, "P C"]:
+        """That of a look-alike; kept where it takes little memory."""
+        if index < len(self.drawn):
+            return self.drawn[index]
+        found = np.random.default_rng([0, index]).standard_normal(self.shows.shape, np.float32)
+        if len(found) <= MANY:
+            self.drawn.append(found)
+        return found
 
 
 def _less(picture: Any, shown: Float[np.ndarray, "P C"], errors: Float[np.ndarray, "P C"]) -> Any:
