@@ -98,7 +98,9 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             free = fit.free & [[True], [True], [False]]
             pictures = fit.pictures if problem.loss == "squared" else None
             rest = _held_plausible(most_likely(_fit_model(fit.model, observed, free, pictures)), observed)
-            fit = rest._replace(moved=(_by_highlight(fit, rest, observed),))
+            stays = np.append((rest.optimum.x > 0).ravel(), False)
+            moved, dropped = [stays * one for one in fit.moved], (_by_highlight(fit, rest, observed),)
+            fit = rest._replace(moved=moved, dropped=dropped)
             result = _interpreted(fit, observed, choice, hidden)
     if grown is not even:
         # Of the picture as it is, not as noise weighs it.
@@ -589,7 +591,7 @@ def _interpreted(
     fit: ModelFit, observed: Observed, choice: Choice | None, hidden: str = "", statistics: Residual | None = None
 ) -> FitResult:
     if choice is not None:
-        fit = fit._replace(moved=(*fit.moved, choice.dropped))
+        fit = fit._replace(dropped=(*fit.dropped, choice.dropped))
     result = interpret(fit, observed, hidden, statistics)
     warnings, share = list(result.warnings), fit.residual
     structure = any("structure" in text for text in warnings)

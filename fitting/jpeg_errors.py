@@ -23,7 +23,7 @@ from brdf.images.jpeg import Jpeg
 from brdf.vectors import quotient
 from fitting.likelihood import Bounds
 from fitting.maximum_likelihood import bounds_of, change, most_likely
-from fitting.model_fit import ModelFit
+from fitting.model_fit import Evidence, ModelFit
 from fitting.pixels import Observed
 from fitting.problem import Target
 from fitting.solver.nnls import scaled_inverse
@@ -42,11 +42,10 @@ MOST_FITS, ENOUGH_CHANGE, ENOUGH_NEARER = 8, 0.5, 2e-3
 APPROACH = 2.0
 # Of more pixels than this a part is fitted first, in rows of the blocks of colours; then all, so often.
 MANY, PART, BLOCK, MOST_WHOLE_FITS = 1 << 17, 4, 16, 2
-# Of so many pixels, in rows about the highlights, it is asked what a codec hides.
-TELLING = 1 << 16
-# How far numbers are moved at first, in standard errors; not along axes of less than this share of their variances. A
-# direction of which pixels tell less than this share of the others is told by none.
-FIRST_STEP, DEPENDENT, LEAST_KNOWN = 2.0, 1e-9, 1e-14
+# How far numbers are moved at first, in standard errors.
+FIRST_STEP = 2.0
+# Axes of less than this share of a variance, and directions that lower the cost by less than this share, are rounding.
+LEAST_VARIANCE, LEAST_KNOWN = 1e-9, 1e-14
 # Of a JPEG.
 LARGEST_CODE = 255.0
 
@@ -61,9 +60,11 @@ def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, O
     """The most likely fit to the pixels of a problem, less what compression does to look-alikes; and these pixels."""
     pictures, compressed = list(fit.pictures), list(map(_Compressed.of, observed.problem.targets))
     fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
-    if _pixels(pictures) > MANY and not any(picture.is_sampled for picture in pictures):
-        some = [_rows(picture, PART) for picture in pictures]
-        few, parts = _subset(some, pictures, compressed)
+    if sum(len(one.shows) for one in compressed) > MANY and not any(picture.is_sampled for picture in pictures):
+        some = list(map(_part, pictures))
+        of_target = _parted(some, [one.shows for one in compressed])
+        parts = [dataclasses.replace(one, shows=one.shows[own]) for one, own in zip(compressed, of_target, strict=True)]
+        few = [picture.on_host(np.flatnonzero(own)) for picture, own in zip(pictures, some, strict=True)]
         fit = fit._replace(optimum=_nearest(fit._replace(pictures=few), parts, most, count).optimum)
         compressed = [
             dataclasses.replace(one, kind=part.kind, settled=True) for one, part in zip(compressed, parts, strict=True)
@@ -78,31 +79,34 @@ def allowing_for_codec(fit: ModelFit, observed: Observed, covariance: Float[np.n
     """A fit whose errors hold by how much its coefficients may be off before what the codec leaves shows it.
 
     Those of a term are moved along the axes of their covariance, both ways and twice as far each time, until the
-    estimate from what comes back of such a picture moves by a standard error. Of a large picture the rows about the
-    highlight tell; of one whose lobes are made anew at each evaluation, and which would take too long, nothing is told.
+    estimate from what comes back of such a picture moves by a standard error. Of large pictures many blocks tell, each
+    by other steps of the codec: they are as they were.
+
+    Args:
+        fit: the most likely one, less what compression does to look-alikes.
+        observed: its pixels.
+        covariance: of x_a, x_d, x_s, channel after channel, and n.
     """
-    evidence, pictures, compressed = fit.evidence, fit.pictures, list(map(_Compressed.of, observed.problem.targets))
-    many = _pixels(pictures) > TELLING
-    if evidence is None or (many and any(picture.is_sampled for picture in pictures)):
+    evidence = fit.evidence
+    if evidence is None or sum(len(picture.target) for picture in fit.pictures) > MANY:
         return fit
-    x, working, moved = evidence.optimum.x, evidence.pictures, list(fit.moved)
-    if many:
-        some = _about_highlights(pictures, fit.owner)
-        (working, _), (pictures, compressed) = _subset(some, working, compressed), _subset(some, pictures, compressed)
-    response = _Response(fit, pictures, working, LookAlikes(compressed, COMPARED))
+    x, moved, compressed = evidence.optimum.x, list(fit.moved), list(map(_Compressed.of, observed.problem.targets))
+    response = _Response(fit, evidence, LookAlikes(compressed, COMPARED))
+    for one in compressed:  # each of them has the noise of what was fitted
+        one.settled = True
     for term in np.arange(x.size).reshape(x.shape):
         for axis, part in _axes(covariance, term):
-            both = [_hidden(response, x, sign * axis, sign * part) for sign in (1.0, -1.0)]
+            both = [_distance(response, x, sign * axis, sign * part) for sign in (1.0, -1.0)]
             beyond = float(np.mean(both)) ** 2 - 1
             if beyond > 0:
                 moved.append(math.sqrt(beyond) * axis)
     return fit._replace(moved=moved)
 
 
-def _hidden(
+def _distance(
     response: "_Response", x: Float[np.ndarray, "3 C"], step: Float[np.ndarray, " U"], part: Float[np.ndarray, " U"]
 ) -> float:
-    """How many steps coefficients may be off until the estimate is by one: no farther than the first is 0, or twice."""
+    """How many steps it takes until the estimate moves by one, at most until the first is 0 or the largest is twice."""
     at, size = x.ravel(), step[:-1]
     most = np.max(at[size != 0]) / np.max(np.abs(size))
     most = min(most, np.min(at[size < 0] / -size[size < 0], initial=np.inf))
@@ -116,7 +120,7 @@ def _axes(
     error = np.sqrt(np.diag(covariance)[own])
     variances, axes = np.linalg.eigh(quotient(quotient(covariance[np.ix_(own, own)], error), error[:, None]))
     for variance, axis in zip(variances, axes.T, strict=True):
-        if variance > DEPENDENT:
+        if variance > LEAST_VARIANCE:
             step, part = np.zeros((2, len(covariance)))
             step[own], part[own] = error * axis * math.sqrt(variance), quotient(axis, error) / math.sqrt(variance)
             yield step, part
@@ -138,18 +142,14 @@ class _Response:
     Over x_a, x_d, x_s, channel after channel, and n.
     """
 
-    def __init__(
-        self, fit: ModelFit, pictures: Sequence[Picture], working: Sequence[Picture], look_alikes: "LookAlikes"
-    ):
-        """Of the pictures of a fit, or of some of their pixels, and the same with working weights."""
-        evidence = fit.evidence
-        assert evidence is not None
+    def __init__(self, fit: ModelFit, evidence: Evidence, look_alikes: "LookAlikes"):
+        """Of the pictures of a fit, by what these say."""
         at, channels = evidence.optimum, evidence.optimum.x.shape[1]
-        self._at, self._pictures, self._look_alikes = at, pictures, look_alikes
+        self._at, self._pictures, self._look_alikes = at, fit.pictures, look_alikes
         self._precision = np.eye(channels) / evidence.noise**2 if evidence.precision is None else evidence.precision
         # Columns in units of the noise, and what makes codes such.
         self._columns, self._units, gram = [], [], np.zeros((channels, channels, 4, 4))
-        for picture, weighed in zip(pictures, working, strict=True):
+        for picture, weighed in zip(fit.pictures, evidence.pictures, strict=True):
             slope = bounds_of(picture).codes(np.asarray(picture.predict(at.n, at.x)))[1]
             root = np.sqrt(np.asarray(weighed.weights) / np.diag(self._precision))
             columns = weighed.columns(at.n) * root
@@ -176,37 +176,12 @@ class _Response:
         return join_channels(self._gram, product, product[:, 0], self._at.x[2])
 
 
-def _about_highlights(pictures: Sequence[Picture], owner: Sequence[int]) -> list[Bool[np.ndarray, " P"]]:
-    """Of each picture, which may be in bands, about as many pixels as tell, in whole rows: where the highlight is."""
-    peaks = [-np.inf if one.lobe is None else float(np.max(one.lobe.peak)) for one in pictures]
-    brightest = {one: max((peaks[i], -i) for i in np.flatnonzero(np.equal(owner, one)))[1] for one in owner}
-    some = []
-    for index, picture in enumerate(pictures):
-        parts = -(-len(picture.target) * len(brightest) // TELLING)
-        chosen = -brightest[owner[index]] == index
-        some.append(_rows(picture, parts) if chosen else np.zeros(len(picture.target), bool))
-    return some
-
-
-def _pixels(pictures: Sequence[Picture]) -> int:
-    return sum(len(picture.target) for picture in pictures)
-
-
-def _rows(picture: Picture, parts: int) -> Bool[np.ndarray, " P"]:
-    """Those whole rows of a picture, or of a band of it, one of so many parts, that are nearest to the highlight."""
+def _part(picture: Picture) -> Bool[np.ndarray, " P"]:
+    """Those whole rows of a picture, or of a band of it, that are nearest to the middle of the highlight."""
     width, count = int(bounds_of(picture).width), len(picture.target)
-    size = min(width * max(BLOCK, count // width // parts // BLOCK * BLOCK), count)
+    size = min(width * max(BLOCK, count // width // PART // BLOCK * BLOCK), count)
     middle = 0 if picture.lobe is None else int(np.argmax(picture.lobe.peak))
     return np.arange(count) // size == min(middle // size, count // size - 1)
-
-
-def _subset(
-    some: Sequence[Bool[np.ndarray, " P"]], pictures: Sequence[Picture], compressed: Sequence["_Compressed"]
-) -> tuple[list[Picture], list["_Compressed"]]:
-    """Some pixels of pictures, or of their bands but for those that have none, and of what was compressed."""
-    of_target = _parted(some, [one.shows for one in compressed])
-    parts = [dataclasses.replace(one, shows=one.shows[own]) for one, own in zip(compressed, of_target, strict=True)]
-    return [one.on_host(np.flatnonzero(own)) for one, own in zip(pictures, some, strict=True) if own.any()], parts
 
 
 def _parted(parts: Sequence[np.ndarray], like: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -267,10 +242,8 @@ class LookAlikes:
     def come_back(
         self, pictures: Sequence[Any], radiance: Sequence[Float[np.ndarray, "P C"]]
     ) -> list[Float[np.ndarray, "P C"]]:
-        """What comes back of predictions, in codes, with the noise of the first; 0 of a value that says nothing."""
+        """What comes back of predictions, in codes; 0 of a value that says nothing."""
         shown, errors, _ = self._through(pictures, radiance)
-        for one in self._compressed:
-            one.settled = True
         return list(map(np.add, map(np.nan_to_num, shown), errors))
 
     def _through(self, pictures: Sequence[Any], radiance: Sequence[Float[np.ndarray, "P C"]]) -> tuple[Any, Any, float]:

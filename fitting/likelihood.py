@@ -90,7 +90,7 @@ def _raised(base: AnyArray, power: float) -> Any:
     """Numbers above 0 to a power, which takes two to three times as long as the exponential of the logarithm."""
     if not isinstance(base, np.ndarray):
         return jnp.exp(power * jnp.log(base))
-    found = np.log(base, out=np.empty_like(base))
+    found = np.asarray(np.log(base))
     found *= power
     return np.exp(found, out=found)
 

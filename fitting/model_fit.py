@@ -73,6 +73,7 @@ class ModelFit(NamedTuple):
         owner: of which picture each of ``pictures`` is, which may be a band of it.
         moved: by how much each of some causes may have moved x_a, x_d, x_s, channel after channel, and n, beside what
             pixels leave.
+        dropped: the same of terms that were left out.
         copies: the channels are copies of each other.
     """
 
@@ -87,6 +88,7 @@ class ModelFit(NamedTuple):
     evidence: Evidence | None = None
     owner: Sequence[int] = ()
     moved: Sequence[Float[np.ndarray, " U"]] = ()
+    dropped: Sequence[Float[np.ndarray, " U"]] = ()
     copies: bool = False
 
     def held(self, n_range: tuple[float, float]) -> str:

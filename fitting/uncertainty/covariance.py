@@ -188,7 +188,7 @@ def uncertainty(
     variance = np.maximum(np.diag(covariance), 0.0)
     # Where this is larger than the picture a number is not determined, whatever others at their bound may be. What errs
     # together makes errors larger, but not the numbers less determined.
-    dropped = np.sum(np.square([np.zeros(variance.size), *fit.moved]), axis=0)
+    dropped = np.sum(np.square([np.zeros(variance.size), *fit.moved, *fit.dropped]), axis=0)
     own = np.diag(inner.covariance) + dropped if pixels.scatter is None else np.diag(inner.independent)
     deviations = np.sqrt(np.maximum([variance, own], 0.0))
     reaches = [student_95(max(one, FEWEST_DEGREES)) for one in degrees.tolist()]
@@ -294,8 +294,8 @@ def _with_bounds(
     size = len(inner.covariance)
     off = np.array([np.zeros(size), *offs])
     # What was dropped is at its bound too, and counts once.
-    beside = [np.sqrt(np.maximum(one**2 - np.sum(off**2, axis=0), 0.0)) * np.sign(one) for one in fit.moved]
-    off = np.vstack([off, *beside])
+    beside = [np.sqrt(np.maximum(one**2 - np.sum(off**2, axis=0), 0.0)) * np.sign(one) for one in fit.dropped]
+    off = np.vstack([off, *beside, *fit.moved])
     held = np.eye(size)
     held[2 * optimum.x.shape[1] : -1, -1] = -scale_growth(fit.model, optimum.n) * optimum.x[2]
     return held @ (inner.covariance + off.T @ off) @ held.T

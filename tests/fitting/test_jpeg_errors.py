@@ -152,8 +152,9 @@ def test_how_far_off_a_number_has_to_be_until_it_is_seen(seen, most, distance):
     assert jpeg_errors._detection_distance(seen, most) == pytest.approx(distance)
 
 
-@pytest.mark.parametrize(("k_s", "model"), [(None, "named"), (0.03, "auto")])
-def test_what_comes_back_as_it_went_in_hides_nothing(tmp_path, monkeypatch, k_s, model):
+@pytest.fixture
+def allowed(monkeypatch):
+    """Of each fit that allows for what its codec hides: itself, standard errors, and what is hidden beside these."""
     seen = []
 
     def allowing(fit, observed, covariance):
@@ -162,12 +163,29 @@ def test_what_comes_back_as_it_went_in_hides_nothing(tmp_path, monkeypatch, k_s,
         return after
 
     monkeypatch.setattr(core, "allowing_for_codec", allowing)
+    return seen
+
+
+@pytest.mark.parametrize(("k_s", "model"), [(None, "named"), (0.03, "auto")])
+def test_what_comes_back_as_it_went_in_hides_nothing(tmp_path, monkeypatch, allowed, k_s, model):
     monkeypatch.setattr(jpeg_errors._Compressed, "_look_alikes", lambda self, clean, *_: (np.zeros_like(clean), 1.0))
     one = ball(3, channels=3, k_s=k_s)
     fitting.fit(COLOUR.picture(one.drawn(), 3, tmp_path), one.scene(), model=one.model if model == "named" else model)
-    ((fit, error, moved),) = seen
+    ((fit, error, moved),) = allowed
     assert (fit.tied is None) == (model == "named")
     assert np.all(np.abs(moved) <= 0.3 * error)
+
+
+def test_what_is_hidden_is_in_the_errors_whatever_is_at_its_bound(tmp_path, allowed):
+    one, kept = ball(6, channels=3, size=96, k_s=3e-4), dataclasses.replace(COLOUR, quality=75)
+    result = fitting.fit(kept.picture(one.drawn(), 6, tmp_path), one.scene(), model="blinn-phong")
+    ((fit, _, moved),) = allowed
+    x = fit.evidence.optimum.x
+    assert not x[2].all()
+    hidden = np.sqrt(np.sum(np.square(moved), axis=0))[:6] / x[:2].ravel()
+    told = [own.error / own.value for key in ("k_a", "k_d") for own in result[key]]
+    assert np.max(hidden) > 0.01
+    assert np.all(np.array(told) >= hidden)
 
 
 def test_errors_hold_what_the_codec_hides(tmp_path):
