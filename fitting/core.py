@@ -37,8 +37,8 @@ from fitting.solver.refinement import TOLERANCE_DOUBLE
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels, places_of
 from fitting.tile import picture_of
-from fitting.uncertainty.covariance import NO_TRACE, inverse_among, residual_noise, specular_gain
-from fitting.uncertainty.interpretation import interpret, shared_errors
+from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_gain
+from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual import SOME_PIXELS, Residual, residual_statistics, variance_inflation
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
@@ -427,7 +427,7 @@ def _allowing_for_codec(fit: ModelFit, observed: Observed) -> ModelFit:
 def _covariances(fit: ModelFit, observed: Observed) -> tuple[Float[np.ndarray, "U U"], Float[np.ndarray, "U U"]]:
     """Those of a fit's numbers by what rounded values say, if pixels erred alone and as they do."""
     assert fit.evidence is not None
-    alone = inverse_among(fit.evidence.normal.gram, design_of(fit.evidence.optimum.x > 0, fit.tied))
+    alone = alone_covariance(fit.evidence.normal, fit.evidence.optimum.x, fit.tied)
     scatter = shared_errors(fit.evidence, observed)[0]
     return alone, alone if scatter is None else alone @ scatter @ alone
 

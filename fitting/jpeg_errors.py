@@ -90,27 +90,17 @@ def allowing_for_codec(fit: ModelFit, observed: Observed, covariance: Float[np.n
     evidence = fit.evidence
     if evidence is None or sum(len(picture.target) for picture in fit.pictures) > MANY:
         return fit
-    x, moved, compressed = evidence.optimum.x, list(fit.moved), list(map(_Compressed.of, observed.problem.targets))
+    moved, compressed = list(fit.moved), list(map(_Compressed.of, observed.problem.targets))
     response = _Response(fit, evidence, LookAlikes(compressed, COMPARED))
     for one in compressed:  # each of them has the noise of what was fitted
         one.settled = True
-    for term in np.arange(x.size).reshape(x.shape):
+    for term in np.arange(fit.free.size).reshape(fit.free.shape):
         for axis, part in _axes(covariance, term):
-            both = [_distance(response, x, sign * axis, sign * part) for sign in (1.0, -1.0)]
+            both = [response.distance(sign * axis, sign * part) for sign in (1.0, -1.0)]
             beyond = float(np.mean(both)) ** 2 - 1
             if beyond > 0:
                 moved.append(math.sqrt(beyond) * axis)
     return fit._replace(moved=moved)
-
-
-def _distance(
-    response: "_Response", x: Float[np.ndarray, "3 C"], step: Float[np.ndarray, " U"], part: Float[np.ndarray, " U"]
-) -> float:
-    """How many steps it takes until the estimate moves by one, at most until the first is 0 or the largest is twice."""
-    at, size = x.ravel(), step[:-1]
-    most = np.max(at[size != 0]) / np.max(np.abs(size))
-    most = min(most, np.min(at[size < 0] / -size[size < 0], initial=np.inf))
-    return _detection_distance(lambda times: float(part @ response(times * step)), float(most))
 
 
 def _axes(
@@ -168,6 +158,16 @@ class _Response:
         for columns, unit, now, still in zip(self._columns, self._units, back, self._still, strict=True):
             product += np.einsum("kpc,pc->ck", columns, (now - still) * unit @ self._precision)
         return self._inverse @ self._joined(product).product
+
+    def distance(self, step: Float[np.ndarray, " U"], part: Float[np.ndarray, " U"]) -> float:
+        """How many steps coefficients are off until the estimate is by one: ``part`` is what of a change is along it.
+
+        At most until the first of them is 0, or the largest has doubled.
+        """
+        x, size = self._at.x.ravel(), step[:-1]
+        most = np.max(x[size != 0]) / np.max(np.abs(size))
+        most = min(most, np.min(x[size < 0] / -size[size < 0], initial=np.inf))
+        return _detection_distance(lambda times: float(part @ self(times * step)), float(most))
 
     def _comes_back(self, x: Float[np.ndarray, "3 C"]) -> list[Float[np.ndarray, "P C"]]:
         return self._look_alikes.come_back(self._pictures, [one.predict(self._at.n, x) for one in self._pictures])

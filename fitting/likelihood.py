@@ -70,13 +70,13 @@ def encoded_and_slope(light: AnyArray, encoding: Encoding, steps: Any) -> tuple[
         return light, xp.ones_like(light)
     if encoding == "srgb":
         bright, power = light > 0.0031308, 1.0 / 2.4
-        straight = xp is jnp or not bright.all()
-        base = xp.where(bright, light, 1.0) if straight else light
+        all_bright = xp is np and bright.all()
+        base = light if all_bright else xp.where(bright, light, 1.0)
         curved = 1.055 * _raised(base, power)
-        slope = power * curved / base
-        if not straight:
-            return curved - 0.055, slope
-        return xp.where(bright, curved - 0.055, 12.92 * light), xp.where(bright, slope, 12.92)
+        encoded, slope = curved - 0.055, power * curved / base
+        if all_bright:
+            return encoded, slope
+        return xp.where(bright, encoded, 12.92 * light), xp.where(bright, slope, 12.92)
     # A power is infinitely steep at 0; below a quarter of a code it goes on straight, to no code's edge.
     power = 1.0 / encoding
     least = (0.25 / steps) ** encoding
@@ -87,7 +87,7 @@ def encoded_and_slope(light: AnyArray, encoding: Encoding, steps: Any) -> tuple[
 
 
 def _raised(base: AnyArray, power: float) -> Any:
-    """Numbers above 0 to a power, which takes two to three times as long as the exponential of the logarithm."""
+    """Numbers above 0 to a power, by the exponential of the logarithm: a power takes up to three times as long."""
     if not isinstance(base, np.ndarray):
         return jnp.exp(power * jnp.log(base))
     found = np.asarray(np.log(base))

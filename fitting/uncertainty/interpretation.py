@@ -21,7 +21,7 @@ from fitting.result import HELD_PLAUSIBLE, FitResult, Parameter
 from fitting.solver.losses import RELATIVE
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
-from fitting.solver.tied import design_of
+from fitting.solver.tied import NormalEquations, design_of
 from fitting.uncertainty.covariance import (
     AMBIENT_SHARE,
     RESOLUTION,
@@ -178,7 +178,8 @@ def _of_values(
             Errors(residuals(picture, optimum), np.arange(len(picture.target)), width)
             for picture, width in zip(pictures, observed.widths, strict=True)
         )
-        pixels = pixels._replace(scatter=scatter(pictures, optimum, errors, alone_covariance(optimum, fit.tied)))
+        alone = alone_covariance(optimum.normal(), optimum.x, fit.tied)
+        pixels = pixels._replace(scatter=scatter(pictures, optimum, errors, alone))
         return pixels, together, growing
     if growing is not None and uneven is None:
         uneven = weighted_sums(pictures, optimum, growing, inverse=False)
@@ -197,7 +198,9 @@ def _of_codes(
         given = [one[pixel] if len(one) > 1 else one for one, (pixel, _) in zip(known, evidence.places, strict=True)]
         if (misweighted := misweighted_sums(fit.pictures, fit.optimum, 0 * pixels.noise, given)) is not None:
             pixels = pixels._replace(spread=misweighted[0].gram)
-    alone = alone_covariance(fit.optimum, fit.tied) if evidence.together is None else None
+    alone = None
+    if evidence.together is None:
+        alone = alone_covariance(fit.optimum.normal(), fit.optimum.x, fit.tied)
     missed = 0.0 if pixels.missed is None else pixels.missed.size
     shared, together, channels = shared_errors(evidence, observed, alone, missed)
     if not (evidence.scores or observed.copies):
@@ -270,9 +273,11 @@ def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray,
     return sums._replace(squares=np.maximum(sums.squares, of_information.squares))
 
 
-def alone_covariance(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndarray, "U U"]:
-    """Covariance of independent pixels whose weights are inverse variances."""
-    return inverse_among(optimum.normal().gram, design_of(optimum.x > 0, tied))
+def alone_covariance(
+    normal: NormalEquations, x: Float[np.ndarray, "3 C"], tied: np.ndarray | None
+) -> Float[np.ndarray, "U U"]:
+    """Covariance of independent pixels whose weights are inverse variances, at an optimum."""
+    return inverse_among(normal.gram, design_of(x > 0, tied))
 
 
 def _typical_weight(pictures: Sequence[Picture]) -> float:
